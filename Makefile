@@ -1,0 +1,59 @@
+SHELL = /bin/sh
+PYTHON ?= python3
+VENV = .venv
+BIN = $(VENV)/bin
+SOURCES = sb3_cchain benchmarks tests
+# Extras that the demo, the tests and the benchmarks need
+EXTRAS = dev
+
+.PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc clean
+
+# --- The two commands of the README -------------------------------------------------------------------------------------
+
+demo: install
+	$(BIN)/python -m benchmarks.demo $(ARGS)
+
+test: lint check-codestyle type pytest
+
+# --- Set-up: a second call installs nothing again ---------------------------------------------------------------------------
+
+install: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 10))" || { echo "Python 3.10 or later is needed: make PYTHON=python3.11 ..."; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@touch $@
+
+# --- Named as in Stable-Baselines3 --------------------------------------------------------------------------------------
+
+pytest: install
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(ARGS)
+
+pytest-fast: install
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "not slow" $(ARGS)
+
+lint: install
+	$(BIN)/ruff check $(SOURCES)
+
+format: install
+	$(BIN)/ruff check --select I --fix $(SOURCES)
+	$(BIN)/black $(SOURCES)
+
+check-codestyle: install
+	$(BIN)/ruff check --select I $(SOURCES)
+	$(BIN)/black --check --quiet $(SOURCES) || { $(BIN)/black --check $(SOURCES); exit 1; }
+
+type: install
+	$(BIN)/mypy
+
+commit-checks: format type lint
+
+doc: install
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	$(BIN)/python -m sphinx -W -b html docs docs/_build/html
+
+clean:
+	rm -rf $(VENV) build dist docs/_build .mypy_cache .pytest_cache .ruff_cache

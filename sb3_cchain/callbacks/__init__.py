@@ -1,0 +1,6 @@
+"""Callbacks for training in continual environments."""
+
+from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
+from sb3_cchain.callbacks.task_sync import TaskSync
+
+__all__ = ["ContinualMetrics", "TaskSync", "read_returns"]

@@ -1,0 +1,26 @@
+"""What an algorithm adds by itself when its environment is continual."""
+
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
+from sb3_cchain.callbacks.task_sync import TaskSync, is_continual, iterate_callbacks
+
+
+def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> MaybeCallback:
+    """
+    :param callback: What the user gave to ``learn()``
+    :param env: The training environment
+    :return: The same, preceded in a continual environment by the callbacks for it that are not yet there
+    """
+    if not is_continual(env):
+        return callback
+    if callback is None:
+        given: list[BaseCallback] = []
+    elif isinstance(callback, list):
+        given = callback
+    else:
+        given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+    present = {type(c) for c in iterate_callbacks(CallbackList(given))}
+    return [make() for make in (TaskSync, ContinualMetrics) if make not in present] + given

@@ -1,0 +1,170 @@
+"""The weight λ of the churn loss: fixed, or set so that the churn loss keeps its ratio to the base loss."""
+
+import math
+
+import torch as th
+from torch import nn
+
+
+def check_number(name: str, value: object, minimum: float = 0.0, exclusive: bool = False, integer: bool = False) -> None:
+    """
+    :param name: The argument's name, for the message
+    :param value: Its value
+    :param minimum: The least value allowed
+    :param exclusive: Whether ``minimum`` itself is forbidden
+    :param integer: Whether the value must be an integer
+    :raises ValueError: Naming argument, value and what is allowed
+    """
+    kind = int if integer else (int, float)
+    if isinstance(value, kind) and math.isfinite(value) and (value > minimum or (value == minimum and not exclusive)):
+        return
+    expected = "an integer" if integer else "a number"
+    bound = "greater than" if exclusive else "greater than or equal to"
+    raise ValueError(f"`{name}` must be {expected} {bound} {minimum:g}, got {value!r}")
+
+
+class ChurnCoefficient(nn.Module):
+    """
+    A fixed λ. Also the interface of every λ: ``value``, ``update(base_loss, churn_loss)``, ``reset()``.
+
+    :param initial: λ; 0 switches churn reduction off
+    """
+
+    def __init__(self, initial: float):
+        super().__init__()
+        check_number("churn_coef", initial)
+        self.initial = float(initial)
+
+    @property
+    def value(self) -> float:
+        """λ, the factor of the churn loss."""
+        return self.initial
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether λ is and stays 0."""
+        return self.initial == 0
+
+    def update(self, base_loss: float, churn_loss: float) -> None:
+        """
+        Take the losses of a finished iteration (or update) into account.
+
+        :param base_loss: The loss that the churn loss is added to
+        :param churn_loss: The churn loss, not multiplied by λ
+        """
+
+    def reset(self) -> None:
+        """Forget the losses seen, as the released code does when the task switches."""
+
+
+class AdaptiveChurnCoefficient(ChurnCoefficient):
+    r"""
+    :math:`\lambda = \beta \, \overline{|L|} \, / \, \overline{|L_{churn}|}`, with running means over a window
+    (Appendix A.1 of the C-CHAIN paper; warm-up, window and minimum as in the released code).
+
+    An iteration is whatever is between two calls of ``update``: one ``train()`` of PPO, one gradient step of DQN.
+    The history is kept in buffers, in double precision, and so is saved and restored with ``state_dict``.
+
+    :param target_ratio: β, the size of λ·L_churn relative to L
+    :param initial: λ during the warm-up
+    :param warmup: Iterations (calls of ``update``) until λ adapts
+    :param window: Iterations that the running means go over
+    :param minimum: λ after the warm-up is at least this
+    """
+
+    base_losses: th.Tensor
+    churn_losses: th.Tensor
+    n_seen: th.Tensor
+
+    def __init__(
+        self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0
+    ):
+        super().__init__(initial)
+        check_number("target_churn_ratio", target_ratio, exclusive=True)
+        check_number("churn_warmup", warmup, integer=True)
+        check_number("churn_window", window, minimum=1, integer=True)
+        check_number("churn_coef_min", minimum)
+        self.target_ratio = float(target_ratio)
+        self.warmup = warmup
+        self.minimum = float(minimum)
+        self.register_buffer("base_losses", th.zeros(window, dtype=th.float64))
+        self.register_buffer("churn_losses", th.zeros(window, dtype=th.float64))
+        self.register_buffer("n_seen", th.zeros((), dtype=th.int64))
+
+    @property
+    def value(self) -> float:
+        """λ, the factor of the churn loss."""
+        n_seen = int(self.n_seen)
+        if n_seen < max(self.warmup, 1):
+            return self.initial
+        n_kept = min(n_seen, len(self.base_losses))
+        # 1e-8 as in the released code: a network that does not churn at all has no ratio
+        ratio = self.base_losses[:n_kept].sum() / (self.churn_losses[:n_kept].sum() + n_kept * 1e-8)
+        return max(self.target_ratio * float(ratio), self.minimum)
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether λ is and stays 0."""
+        return False
+
+    def update(self, base_loss: float, churn_loss: float) -> None:
+        """
+        Take the losses of a finished iteration into account.
+
+        :param base_loss: The loss that the churn loss is added to; its absolute value counts
+        :param churn_loss: The churn loss, not multiplied by λ; its absolute value counts
+        """
+        slot = int(self.n_seen) % len(self.base_losses)
+        self.base_losses[slot] = abs(base_loss)
+        self.churn_losses[slot] = abs(churn_loss)
+        self.n_seen += 1
+
+    def reset(self) -> None:
+        """Forget the losses seen and begin a new warm-up."""
+        self.n_seen.zero_()
+
+
+def make_coefficient(
+    churn_coef: float | str,
+    target_ratio: float | str,
+    default_target_ratio: float,
+    *,
+    warmup: int,
+    window: int,
+    minimum: float,
+) -> ChurnCoefficient:
+    """
+    Read ``churn_coef`` as SAC reads ``ent_coef``: a number is a fixed λ, ``"auto"`` adapts it, ``"auto_10"`` adapts it
+    and uses 10 during the warm-up.
+
+    :param churn_coef: λ, ``"auto"`` or ``"auto_<initial value>"``
+    :param target_ratio: β, or ``"auto"`` for the default
+    :param default_target_ratio: The default β
+    :param warmup: Iterations until λ adapts
+    :param window: Iterations that the running means go over
+    :param minimum: λ after the warm-up is at least this
+    :return: The coefficient
+    :raises ValueError: Naming the argument, when it cannot be read or lies outside its range
+    """
+    adaptive = AdaptiveChurnCoefficient(
+        default_target_ratio if target_ratio == "auto" else _number("target_churn_ratio", target_ratio, '"auto"'),
+        warmup=warmup,
+        window=window,
+        minimum=minimum,
+    )
+    allowed = '"auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
+    if isinstance(churn_coef, str) and churn_coef.startswith("auto"):
+        if churn_coef != "auto":
+            initial = _number("churn_coef", churn_coef.removeprefix("auto_"), allowed)
+            check_number("churn_coef", initial)
+            adaptive.initial = initial
+        return adaptive
+    return ChurnCoefficient(_number("churn_coef", churn_coef, allowed))
+
+
+def _number(name: str, value: object, alternatives: str) -> float:
+    # Strings too: that is how numbers come from a command line
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"`{name}` must be a number, {alternatives}; got {value!r}") from None

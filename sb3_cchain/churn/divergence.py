@@ -1,0 +1,40 @@
+"""
+How far a network's outputs moved: pure functions of the outputs before (``old``) and after (``new``) an update.
+
+Each returns a scalar, the mean over the batch. ``old`` is a constant: no gradient flows into it.
+"""
+
+from collections.abc import Callable
+
+import torch as th
+
+Divergence = Callable[[th.Tensor, th.Tensor], th.Tensor]
+
+# Inside the logarithm, as in the code released with the paper
+LOG_EPS = 1e-8
+
+
+def cross_entropy(old: th.Tensor, new: th.Tensor) -> th.Tensor:
+    r"""
+    Cross-entropy of categorical distributions, :math:`-\sum_a p_{old}(a) \log(p_{new}(a) + 10^{-8})`.
+
+    Its value includes the entropy of ``old``, which sets the scale of the target ratio β (1e3 to 1e5 in the paper).
+    ``cross_entropy(old, new) - cross_entropy(old, old)`` is the Kullback-Leibler divergence KL(old ‖ new).
+
+    :param old: Probabilities before the update, ``(batch_size, ..., n_categories)``. Dimensions between the first and
+        the last are independent distributions (the sub-actions of ``MultiDiscrete``); they are summed.
+    :param new: Probabilities after the update, of the same shape
+    :return: Mean over the batch
+    """
+    return -(old * th.log(new + LOG_EPS)).sum() / len(old)
+
+
+def mean_squared_difference(old: th.Tensor, new: th.Tensor) -> th.Tensor:
+    """
+    Mean squared difference over batch and outputs: action means of a Gaussian policy, or action values.
+
+    :param old: Outputs before the update, ``(batch_size, ...)``
+    :param new: Outputs after the update, of the same shape
+    :return: Mean over all elements
+    """
+    return (new - old).pow(2).mean()

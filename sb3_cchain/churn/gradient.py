@@ -1,0 +1,38 @@
+"""Adds a gradient of one's own to every update of somebody else's training loop."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+
+
+@contextmanager
+def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) -> Iterator[None]:
+    """
+    Call ``backward()`` right after each ``optimizer.zero_grad()`` inside the ``with`` block.
+
+    Gradients accumulate in PyTorch, so what ``backward`` puts there is added to the gradient of the loop's own loss
+    before the loop clips and steps: the update is the one of ``loss + extra_loss``, without a copy of the loop.
+    A hook on ``optimizer.step()`` would come too late, after the clipping.
+
+    The blocks nest, the innermost one running last; nothing stays patched afterwards.
+
+    :param optimizer: The optimiser whose loop runs ``zero_grad → loss.backward → (clip) → step``
+    :param backward: Adds its gradient to the parameters' ``.grad``, for instance ``lambda: extra_loss().backward()``
+    """
+    zero_grad = optimizer.zero_grad
+    outer = vars(optimizer).get("zero_grad")
+
+    def zero_grad_and_backward(*args: Any, **kwargs: Any) -> None:
+        zero_grad(*args, **kwargs)
+        backward()
+
+    optimizer.zero_grad = zero_grad_and_backward  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        if outer is None:
+            del optimizer.zero_grad
+        else:
+            optimizer.zero_grad = outer  # type: ignore[method-assign]

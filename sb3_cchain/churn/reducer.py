@@ -1,0 +1,117 @@
+"""The churn loss of a network against itself one update ago, for any training loop."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_cchain.churn.coefficient import ChurnCoefficient
+from sb3_cchain.churn.divergence import Divergence
+
+Observations = th.Tensor | Mapping[str, th.Tensor]
+
+
+class ChurnReducer(nn.Module):
+    r"""
+    Continual Churn Approximated Reduction (C-CHAIN), https://arxiv.org/abs/2506.00592, for any training loop::
+
+        reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(0.1))
+        for batch, reference in batches:        # `reference` shares no sample with `batch`
+            optimizer.zero_grad()
+            reducer.backward(reference)         # adds the gradient of λ·L_churn
+            loss(network(batch)).backward()
+            optimizer.step()
+
+    Update :math:`t-1` was made on ``batch``; the churn that it caused is how far the outputs on its ``reference`` moved,
+    :math:`L_{churn}(\theta_t) = D(f_{\theta_{t-1}}(x_{ref}), f_{\theta_t}(x_{ref}))`, and update :math:`t` is made on the
+    usual loss plus :math:`\lambda L_{churn}`. The released code copies the network at every update to have
+    :math:`\theta_{t-1}`. Here the outputs that are needed of it are computed while it is still the current network, so no
+    copy is made: one forward pass, and one forward and backward pass per update.
+
+    The first update has no previous one, and so no churn loss.
+
+    The reference batch that awaits its next update, the outputs on it, and the history of λ are in ``state_dict()``.
+
+    :param outputs: Maps observations to the outputs that should not churn. Called with gradients enabled or disabled.
+    :param divergence: Compares outputs before and after, ``divergence(old, new)``
+    :param coefficient: λ
+    """
+
+    def __init__(
+        self,
+        outputs: Callable[[Any], th.Tensor],
+        divergence: Divergence,
+        coefficient: ChurnCoefficient,
+    ):
+        super().__init__()
+        # Not a submodule, where it is a module: the network is not part of the reducer's state
+        self._outputs = [outputs]
+        self.divergence = divergence
+        self.coefficient = coefficient
+        # Whether the training loop has warned that it found no reference batch outside the minibatch
+        self.warned_of_overlap = False
+        self.reference: Observations | None = None
+        self.old_outputs: th.Tensor | None = None
+        # Since the last `end_iteration()`, one for each update
+        self.losses: list[float] = []
+        self.churns: list[float] = []
+
+    def backward(self, reference: Observations) -> None:
+        """
+        Add the gradient of λ·L_churn, and remember the present outputs on ``reference`` for the next update.
+
+        To be called once per update, between ``zero_grad()`` and the optimiser's step.
+
+        :param reference: Observations outside the minibatch of the update that is about to be made
+        :raises ValueError: When the churn loss is NaN or infinite. The parameters have not been touched.
+        """
+        outputs = self._outputs[0]
+        if self.reference is not None and self.old_outputs is not None:
+            with th.enable_grad():
+                new_outputs = outputs(self.reference)
+                churn_loss = self.divergence(self.old_outputs, new_outputs)
+            loss = churn_loss.item()
+            if not -float("inf") < loss < float("inf"):
+                raise ValueError(
+                    f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values. "
+                    "The parameters have not been updated. Lower the learning rate or `churn_coef`, or set `max_grad_norm`."
+                )
+            (self.coefficient.value * churn_loss).backward()
+            with th.no_grad():
+                self.churns.append(loss - self.divergence(self.old_outputs, self.old_outputs).item())
+            self.losses.append(loss)
+        self.reference = reference
+        with th.no_grad():
+            self.old_outputs = outputs(reference)
+
+    def end_iteration(self, base_loss: float) -> None:
+        """
+        Give λ the losses since the last call; without an update in between there is nothing to give.
+
+        :param base_loss: The mean over these updates of the loss that the churn loss was added to
+        """
+        if self.losses:
+            self.coefficient.update(base_loss, sum(self.losses) / len(self.losses))
+        self.losses, self.churns = [], []
+
+    def forget_reference(self) -> None:
+        """Drop the reference batch: the next update has no churn loss (after the network was replaced, say)."""
+        self.reference = self.old_outputs = None
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """
+        :return: What ``state_dict()`` holds beside the buffers
+        """
+        reference = self.reference
+        return {
+            "reference": dict(reference) if isinstance(reference, Mapping) else reference,
+            "old_outputs": self.old_outputs,
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """
+        :param state: What ``get_extra_state()`` returned
+        """
+        self.reference = state["reference"]
+        self.old_outputs = state["old_outputs"]

@@ -1,0 +1,116 @@
+"""The outputs of an SB3 actor-critic policy whose churn is measured, by kind of action distribution."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch as th
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    MultiCategoricalDistribution,
+)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_squared_difference
+
+# β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
+# of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
+DEFAULT_TARGET_RATIO: dict[Divergence, float] = {cross_entropy: 1e4, mean_squared_difference: 0.05}
+
+# Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
+_MODE_FREE_PACKAGES = (
+    "stable_baselines3.",
+    "sb3_contrib.",
+    "sb3_cchain.",
+    "torch.nn.modules.activation",
+    "torch.nn.modules.container",
+    "torch.nn.modules.conv",
+    "torch.nn.modules.flatten",
+    "torch.nn.modules.linear",
+    "torch.nn.modules.normalization",
+    "torch.nn.modules.pooling",
+)
+_MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
+
+
+def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
+    """
+    :param policy: An actor-critic policy
+    :return: Cross-entropy where actions are discrete, mean squared difference of the action means where they are Gaussian
+    :raises TypeError: For an action distribution that is neither
+    """
+    distribution = policy.action_dist
+    if isinstance(distribution, (CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)):
+        return cross_entropy
+    # StateDependentNoiseDistribution (gSDE) has no common base with it but is a Gaussian too
+    if isinstance(distribution, DiagGaussianDistribution) or policy.use_sde:
+        return mean_squared_difference
+    raise TypeError(
+        f"Churn reduction does not know the outputs of {type(distribution).__name__}. It supports categorical, "
+        "multi-categorical, Bernoulli, diagonal Gaussian and state-dependent (gSDE) action distributions."
+    )
+
+
+def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
+    """
+    What the policy's action distribution is made of, without the distribution, whose construction costs as much as the
+    network.
+
+    :param policy: An actor-critic policy
+    :param observations: Batch of observations
+    :return: Probabilities ``(batch_size, n_actions)`` for ``Discrete``, ``(batch_size, n_sub_actions, max_n)`` for
+        ``MultiDiscrete`` (shorter sub-actions padded with 0) and ``(batch_size, n, 2)`` for ``MultiBinary`` actions;
+        means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
+    """
+    features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
+    outputs = policy.action_net(policy.mlp_extractor.forward_actor(features))
+    distribution = policy.action_dist
+    if isinstance(distribution, CategoricalDistribution):
+        return outputs.softmax(dim=1)
+    if isinstance(distribution, MultiCategoricalDistribution):
+        width = max(distribution.action_dims)
+        logits = outputs.split(tuple(distribution.action_dims), dim=1)
+        return th.stack([F.pad(sub.softmax(dim=1), (0, width - sub.shape[1])) for sub in logits], dim=1)
+    if isinstance(distribution, BernoulliDistribution):
+        return th.stack([(-outputs).sigmoid(), outputs.sigmoid()], dim=-1)
+    return outputs
+
+
+def policy_values(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
+    """
+    :param policy: An actor-critic policy
+    :param observations: Batch of observations
+    :return: State values ``(batch_size, 1)``, without gradient
+    """
+    with th.no_grad():
+        return policy.predict_values(observations)
+
+
+def has_training_mode(policy: nn.Module) -> bool:
+    """
+    :param policy: A policy
+    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, or
+        a module that is not known here
+    """
+    return any(
+        not type(module).__module__.startswith(_MODE_FREE_PACKAGES) or isinstance(module, _MODE_DEPENDENT_MODULES)
+        for module in policy.modules()
+    )
+
+
+@contextmanager
+def as_it_acts(policy: ActorCriticPolicy) -> Iterator[None]:
+    """
+    Evaluation mode, inside ``train()``: running BatchNorm statistics and no dropout, whose noise is no churn.
+
+    :param policy: A policy in training mode; left in training mode
+    """
+    policy.set_training_mode(False)
+    try:
+        yield
+    finally:
+        policy.set_training_mode(True)

@@ -1,0 +1,8 @@
+"""Continual environments: sequences of tasks as Gymnasium environments."""
+
+from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.envs.gym_control import ContinualGymControl, ObservationOffset
+from sb3_cchain.envs.registration import register_envs
+from sb3_cchain.envs.reward_scale import RewardScale
+
+__all__ = ["ContinualEnv", "ContinualGymControl", "ObservationOffset", "RewardScale", "register_envs"]

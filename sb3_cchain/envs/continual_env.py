@@ -1,0 +1,210 @@
+"""A sequence of tasks as one Gymnasium environment."""
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from itertools import accumulate
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+from gymnasium.core import ActType, ObsType, RenderFrame
+
+Task = str | Callable[..., gym.Env]
+
+
+class ContinualEnv(gym.Env[ObsType, ActType]):
+    """
+    Tasks that arrive one after the other; the agent is not told.
+
+    A task lasts for ``steps_per_task`` environment steps. The step that ends it truncates the episode, and the next
+    ``reset()`` begins the next task. The last task goes on for ever.
+
+    The agent sees neither the task nor the switch. For logging, ``info["task_id"]`` is the task that the step was made in,
+    and ``info["episode_return"]``, at the end of an episode, its return before any wrapper touched the rewards.
+
+    With several environments side by side steps are counted over all of them, so that they switch together:
+    :class:`~sb3_cchain.callbacks.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
+    ``n_envs``.
+
+    :param tasks: Environment ids, or callables that make an environment; they must agree in their spaces. A callable is
+        given ``render_mode=...`` if and only if one is asked for.
+    :param steps_per_task: Environment steps per task, one number for all or one per task
+    :param n_envs: How many environments step together with this one, itself included
+    :param first_task: The task to begin with; the steps of the tasks before it count as made
+    :param render_mode: As in :func:`gymnasium.make`
+    :raises ValueError: For an empty task list, lengths that are not positive or not one per task, an unknown environment,
+        or tasks whose spaces differ
+    :raises ImportError: When the package that a task needs is not installed
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        steps_per_task: int | Sequence[int],
+        *,
+        n_envs: int = 1,
+        first_task: int = 0,
+        render_mode: str | None = None,
+    ):
+        tasks = _check_tasks(tasks)
+        self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks))
+        if not 0 <= first_task < len(tasks):
+            raise ValueError(f"`first_task` must be between 0 and {len(tasks) - 1} for {len(tasks)} tasks, got {first_task!r}")
+        self.tasks = [_make_task(task, render_mode) for task in tasks]
+        _check_spaces(self.tasks)
+
+        self.observation_space = self.tasks[0].observation_space
+        self.action_space = self.tasks[0].action_space
+        self.metadata = self.tasks[0].metadata
+        self.render_mode = render_mode
+
+        # Total steps at which each task ends; the last does not
+        self._task_ends = list(accumulate(self.steps_per_task))[:-1]
+        self._pinned = False
+        self._seeded: set[int] = set()
+        self._task_id = first_task
+        self.set_clock(([0, *self._task_ends])[first_task], n_envs)
+
+    @property
+    def task_id(self) -> int:
+        """The task of the present episode, counted from 0."""
+        return self._task_id
+
+    @property
+    def n_tasks(self) -> int:
+        """Length of the sequence."""
+        return len(self.tasks)
+
+    @property
+    def task(self) -> gym.Env:
+        """The environment of the present episode."""
+        return self.tasks[self._task_id]
+
+    def set_clock(self, total_steps: int, n_envs: int = 1) -> bool:
+        """
+        Say how far training is. The next ``reset()`` begins an episode of the task of that time.
+
+        :param total_steps: Environment steps made so far, over all environments
+        :param n_envs: Environments that step together with this one, itself included
+        :return: Whether the present episode is of another task, so that a ``reset()`` is due
+        :raises ValueError: When a number is negative or there is no environment
+        """
+        if total_steps < 0 or n_envs < 1:
+            raise ValueError(
+                f"`total_steps` must not be negative and `n_envs` must be at least 1, got {total_steps!r} and {n_envs!r}"
+            )
+        self._total_steps, self._n_envs = total_steps, n_envs
+        self._pinned = False
+        return self._due_task() != self._task_id
+
+    def set_task(self, task_id: int) -> None:
+        """
+        Stay on one task, whatever the number of steps, from the next ``reset()`` on: for evaluation.
+
+        :param task_id: The task, counted from 0
+        :raises ValueError: When there is no such task
+        """
+        if not 0 <= task_id < self.n_tasks:
+            raise ValueError(f"`task_id` must be between 0 and {self.n_tasks - 1}, got {task_id!r}")
+        self._pinned = True
+        self._pinned_task = task_id
+
+    def _due_task(self) -> int:
+        return self._pinned_task if self._pinned else bisect_right(self._task_ends, self._total_steps)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ObsType, dict[str, Any]]:
+        """
+        Begin an episode of the task that is due.
+
+        :param seed: Seeds this and all later tasks
+        :param options: Passed on to the task
+        :return: Observation and info
+        """
+        super().reset(seed=seed)
+        self._task_id = self._due_task()
+        if seed is not None:
+            self._seeded = {self._task_id}
+        elif self._task_id not in self._seeded:
+            # So that one seed determines the whole sequence
+            self._seeded.add(self._task_id)
+            seed = int(self.np_random.integers(2**31))
+        observation, info = self.task.reset(seed=seed, options=options)
+        self._episode_return = 0.0
+        return observation, {**info, "task_id": self._task_id}
+
+    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        One step of the present task.
+
+        :param action: The action
+        :return: Observation, reward, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = self.task.step(action)
+        self._total_steps += self._n_envs
+        self._episode_return += float(reward)
+        truncated = truncated or (not self._pinned and self._due_task() != self._task_id)
+        info = {**info, "task_id": self._task_id}
+        if terminated or truncated:
+            info["episode_return"] = self._episode_return
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> RenderFrame | list[RenderFrame] | None:
+        """
+        :return: The present task's frame
+        """
+        return self.task.render()
+
+    def close(self) -> None:
+        """Close all tasks."""
+        for task in self.tasks:
+            task.close()
+
+
+def _check_tasks(tasks: Sequence[Task]) -> list[Task]:
+    if isinstance(tasks, str):
+        raise TypeError(f"`tasks` must be a list of environment ids or callables, got the string {tasks!r}")
+    tasks = list(tasks)
+    if not tasks:
+        raise ValueError("`tasks` must name at least one task, got an empty list")
+    for position, task in enumerate(tasks):
+        if not isinstance(task, str) and not callable(task):
+            raise TypeError(
+                f"`tasks[{position}]` must be an environment id or a callable that makes an environment, got {task!r}"
+            )
+    return tasks
+
+
+def _check_steps_per_task(steps_per_task: int | Sequence[int], n_tasks: int) -> list[int]:
+    steps = [steps_per_task] * n_tasks if isinstance(steps_per_task, (int, float)) else list(steps_per_task)
+    if len(steps) != n_tasks:
+        raise ValueError(f"`steps_per_task` must be one number or one per task ({n_tasks}), got {len(steps)}: {steps}")
+    if not all(step == int(step) and step > 0 for step in steps):
+        raise ValueError(f"`steps_per_task` must be positive whole numbers of environment steps, got {steps_per_task!r}")
+    return [int(step) for step in steps]
+
+
+def _make_task(task: Task, render_mode: str | None) -> gym.Env:
+    try:
+        if isinstance(task, str):
+            return gym.make(task, render_mode=render_mode)
+        return task() if render_mode is None else task(render_mode=render_mode)
+    except gym.error.UnregisteredEnv as error:
+        # Gymnasium's message ends with the nearest names
+        raise ValueError(f"Unknown environment {task!r} in `tasks`: {error}") from error
+    except gym.error.DependencyNotInstalled as error:
+        raise ImportError(f"Task {task!r} needs a package that is not installed: {error}") from error
+
+
+def _check_spaces(tasks: list[gym.Env]) -> None:
+    for kind in ("observation_space", "action_space"):
+        first = getattr(tasks[0], kind)
+        for position, task in enumerate(tasks):
+            space = getattr(task, kind)
+            if space != first:
+                raise ValueError(
+                    f"All tasks must have the same {kind}, but task 0 ({_name(tasks[0])}) has {first} and task {position} "
+                    f"({_name(task)}) has {space}. Wrap the tasks so that they agree, for instance by padding."
+                )
+
+
+def _name(env: gym.Env) -> str:
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

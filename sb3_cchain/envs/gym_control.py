@@ -1,0 +1,106 @@
+"""Continual Gym Control: one environment whose observations are shifted by another constant in each task."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_cchain.envs.continual_env import ContinualEnv
+
+
+class ObservationOffset(gym.ObservationWrapper):
+    """
+    Adds a constant to each observation.
+
+    The observation space becomes unbounded, so that it is the same whatever the offset.
+
+    :param env: Environment with ``Box`` observations
+    :param offset: What to add, of the observations' shape
+    :raises TypeError: When the observations are not a ``Box``
+    :raises ValueError: When the offset's shape is not the observations'
+    """
+
+    def __init__(self, env: gym.Env, offset: ArrayLike):
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Box):
+            raise TypeError(f"An observation offset needs Box observations, got {space}")
+        self.offset = np.asarray(offset, dtype=space.dtype)
+        if self.offset.shape != space.shape:
+            raise ValueError(f"`offset` must have the observations' shape {space.shape}, got {self.offset.shape}")
+        self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)  # type: ignore[arg-type]
+
+    def observation(self, observation: NDArray) -> NDArray:
+        """
+        :param observation: Of the wrapped environment
+        :return: The observation plus the offset
+        """
+        return observation + self.offset
+
+
+class ContinualGymControl(ContinualEnv):
+    """
+    Continual Gym Control (Section 5.1 and Appendix A.1 of the C-CHAIN paper, after TRAC): a task is the same environment
+    with a fixed offset added to every observation, drawn once per task from N(0, σ²) for each dimension. The first task's
+    offset is zero, and episodes are cut at 400 steps in place of the environment's own limit (both as in the released code).
+
+    :param env_id: The environment, with ``Box`` observations
+    :param n_tasks: Length of the sequence
+    :param steps_per_task: Environment steps per task, one number for all or one per task
+    :param max_episode_steps: Length at which an episode is cut
+    :param offset_std: σ
+    :param offset_seed: Seed of the offsets, which depend on nothing else: not on ``reset(seed=...)``
+    :param offsets: The offsets themselves, ``(n_tasks, *observation_shape)``; read back as the attribute ``offsets``
+    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
+    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param render_mode: As in :func:`gymnasium.make`
+    :raises ValueError: Naming the argument that is out of its range
+    :raises ImportError: When the package that the environment needs is not installed
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        n_tasks: int = 10,
+        steps_per_task: int | Sequence[int] = 160_000,
+        max_episode_steps: int = 400,
+        offset_std: float = 2.0,
+        offset_seed: int = 0,
+        offsets: ArrayLike | None = None,
+        n_envs: int = 1,
+        first_task: int = 0,
+        render_mode: str | None = None,
+    ):
+        if n_tasks < 1:
+            raise ValueError(f"`n_tasks` must be at least 1, got {n_tasks!r}")
+        if max_episode_steps < 1:
+            raise ValueError(f"`max_episode_steps` must be at least 1, got {max_episode_steps!r}")
+        if offset_std < 0:
+            raise ValueError(f"`offset_std` must not be negative, got {offset_std!r}")
+        shape = (n_tasks, *_observation_shape(env_id))
+        if offsets is None:
+            self.offsets = np.random.default_rng(offset_seed).normal(0.0, offset_std, shape).astype(np.float32)
+            self.offsets[0] = 0.0
+        else:
+            self.offsets = np.array(offsets, dtype=np.float32)
+            if self.offsets.shape != shape:
+                raise ValueError(f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {self.offsets.shape}")
+        tasks = [partial(_make_task, env_id, offset, max_episode_steps) for offset in self.offsets]
+        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+
+
+def _observation_shape(env_id: str) -> tuple[int, ...]:
+    env = ContinualEnv([env_id], 1)
+    env.close()
+    if not isinstance(env.observation_space, spaces.Box):
+        raise ValueError(f"`env_id` must be an environment with Box observations; {env_id!r} has {env.observation_space}")
+    return env.observation_space.shape
+
+
+def _make_task(env_id: str, offset: NDArray, max_episode_steps: int, **kwargs: Any) -> gym.Env:
+    return ObservationOffset(gym.make(env_id, max_episode_steps=max_episode_steps, **kwargs), offset)

@@ -1,0 +1,78 @@
+"""C-CHAIN for a stock ``PPO``: the form in which the stock ``rl_zoo3`` command reaches it."""
+
+from contextlib import ExitStack
+from functools import partial
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cchain.callbacks.task_sync import TaskSwitch
+from sb3_cchain.churn import make_coefficient
+from sb3_cchain.common.on_policy_churn import make_policy_reducer, reduced_churn
+
+
+class CChainCallback(BaseCallback):
+    """
+    Trains a stock :class:`~stable_baselines3.PPO` as :class:`~sb3_cchain.CChainPPO` trains, for instance from the YAML file
+    of the stock ``rl_zoo3``::
+
+        callback:
+          - sb3_cchain.CChainCallback:
+              target_churn_ratio: 1.0e+4
+
+    PPO calls its callbacks right before and right after ``train()``, which is when the churn gradient is attached and
+    detached. Unlike ``CChainPPO``, the saved model does not hold the history of λ: resumed training warms up again.
+
+    :param churn_coef: As for ``CChainPPO``
+    :param target_churn_ratio: As for ``CChainPPO``
+    :param churn_warmup: As for ``CChainPPO``
+    :param churn_window: As for ``CChainPPO``
+    :param churn_coef_min: As for ``CChainPPO``
+    :param reset_churn_coef: As for ``CChainPPO``
+    :raises ValueError: Naming the argument that is out of its range
+    """
+
+    def __init__(
+        self,
+        churn_coef: float | str = "auto",
+        target_churn_ratio: float | str = "auto",
+        churn_warmup: int = 10,
+        churn_window: int = 50,
+        churn_coef_min: float = 0.0,
+        reset_churn_coef: bool = False,
+    ):
+        super().__init__()
+        self._make_coefficient = partial(
+            make_coefficient,
+            churn_coef,
+            target_churn_ratio,
+            warmup=churn_warmup,
+            window=churn_window,
+            minimum=churn_coef_min,
+        )
+        self._make_coefficient(default_target_ratio=1.0)  # bad values shall fail now
+        self.reset_churn_coef = reset_churn_coef
+        self._task_switch = TaskSwitch()
+        self._during_train = ExitStack()
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, PPO):
+            raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
+        if hasattr(self.model, "churn_reducer"):
+            raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
+        self.churn_reducer = make_policy_reducer(self.model.policy, self._make_coefficient).to(self.model.device)
+
+    def _on_step(self) -> bool:
+        if self.reset_churn_coef and self._task_switch.happened(self.locals["infos"]):
+            self.churn_reducer.coefficient.reset()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if not self.churn_reducer.coefficient.is_zero:
+            self._during_train.enter_context(reduced_churn(self.model, self.churn_reducer))
+
+    def _on_rollout_start(self) -> None:
+        self._during_train.close()
+
+    def _on_training_end(self) -> None:
+        self._during_train.close()

@@ -1,0 +1,92 @@
+"""
+The command ``sb3-cchain train|enjoy|plot_train|all_plots|plot_from_file``: RL Zoo's own commands, which know our
+algorithms and find our hyperparameters.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+try:
+    import optuna
+    import rl_zoo3.cli
+    from rl_zoo3 import ALGOS
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_onpolicy_params, sample_ppo_params
+except ImportError as error:
+    raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
+
+from sb3_cchain import CChainPPO
+
+OUR_ALGOS = {"ppo_cchain": CChainPPO}
+
+
+def sample_ppo_cchain_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    RL Zoo's search space for PPO, and β.
+
+    :param trial: Optuna's trial
+    :param n_actions: Dimension of continuous actions, 0 for others
+    :param n_envs: Number of environments
+    :param additional_args: See RL Zoo
+    :return: Hyperparameters of ``CChainPPO``
+    """
+    # A decade beyond the paper's values on either side: 1e3 to 1e5 for discrete actions, 0.05 to 0.5 for continuous ones
+    low, high = (5e-3, 5.0) if n_actions > 0 else (1e2, 1e6)
+    target_churn_ratio = trial.suggest_float("target_churn_ratio", low, high, log=True)
+    return {**sample_ppo_params(trial, n_actions, n_envs, additional_args), "target_churn_ratio": target_churn_ratio}
+
+
+def register_algorithms() -> None:
+    """Make our algorithms known to RL Zoo, in place."""
+    ALGOS.update(OUR_ALGOS)
+    HYPERPARAMS_SAMPLER["ppo_cchain"] = sample_ppo_cchain_params
+    HYPERPARAMS_CONVERTER["ppo_cchain"] = convert_onpolicy_params
+
+
+def hyperparams_folder() -> Path:
+    """
+    :return: The folder of our YAML files: inside the installed package, at the root of a checkout
+    """
+    package = Path(__file__).parent
+    inside = package / "zoo_hyperparams"
+    return inside if inside.is_dir() else package.parent / "zoo_hyperparams"
+
+
+def hyperparams_file(algo: str, env_id: str) -> Path | None:
+    """
+    :param algo: Name of the algorithm on the command line
+    :param env_id: Environment id
+    :return: Our YAML file, where we have settings for the environment or where the algorithm is ours; otherwise None,
+        and RL Zoo's settings hold
+    """
+    path = hyperparams_folder() / f"{algo}.yml"
+    if path.is_file() and (algo in OUR_ALGOS or env_id in yaml.safe_load(path.read_text())):
+        return path
+    return None
+
+
+def main() -> None:
+    """Run RL Zoo's command line."""
+    commands = ["train", "enjoy", "plot_train", "all_plots", "plot_from_file"]
+    if len(sys.argv) < 2 or sys.argv[1] not in commands:
+        sys.exit(f"usage: sb3-cchain {{{'|'.join(commands)}}} ...\nThe options are those of RL Zoo: sb3-cchain train --help")
+    register_algorithms()
+    if sys.argv[1] == "train":
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--algo", default="ppo")
+        parser.add_argument("--env", default="CartPole-v1")
+        parser.add_argument("-conf", "--conf-file")
+        given, _ = parser.parse_known_args(sys.argv[2:])
+        ours = hyperparams_file(given.algo, given.env)
+        if given.conf_file is None and ours is not None:
+            sys.argv += ["--conf-file", str(ours)]
+    rl_zoo3.cli.main()
+
+
+if __name__ == "__main__":
+    main()
