@@ -1,0 +1,1 @@
+"""Measures the package; imports it, never the reverse."""

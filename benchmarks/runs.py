@@ -1,0 +1,144 @@
+"""Training runs as processes: each is the command that a user would type, and is never repeated once it is done."""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
+
+DONE = "done.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One training run under the shipped hyperparameters.
+
+    :param algo: Name of the algorithm on the command line
+    :param env_id: Environment id
+    :param seed: Seed of the agent, and of the tasks' offsets: the algorithms meet the same tasks under the same seed
+    :param n_tasks: Length of the task sequence
+    :param steps_per_task: Environment steps per task
+    :param folder: Where the run's files go
+    """
+
+    algo: str
+    env_id: str
+    seed: int
+    n_tasks: int
+    steps_per_task: int
+    folder: Path
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of the whole run."""
+        return self.n_tasks * self.steps_per_task
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.env_id} {self.algo} seed {self.seed}"
+
+    @property
+    def arguments(self) -> list[str]:
+        """The command after ``sb3-cchain``."""
+        return [
+            *("train", "--algo", self.algo, "--env", self.env_id, "--seed", str(self.seed)),
+            *("--n-timesteps", str(self.total_steps), "--eval-freq", "-1", "--num-threads", "1", "--device", "cpu"),
+            *("--log-folder", str(self.folder), "--tensorboard-log", str(self.folder / "tensorboard"), "--verbose", "0"),
+            *("--env-kwargs", f"n_tasks:{self.n_tasks}", f"steps_per_task:{self.steps_per_task}", f"offset_seed:{self.seed}"),
+        ]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run came to its end."""
+        return (self.folder / DONE).exists()
+
+    def start(self) -> subprocess.Popen:
+        """
+        :return: The running process, whose output goes to ``log.txt``
+        """
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        with open(self.folder / "log.txt", "w") as log:
+            log.write(f"sb3-cchain {shlex.join(self.arguments)}\n")
+            log.flush()
+            # As many threads as --num-threads for the libraries that read the environment, too
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            command = [sys.executable, "-m", "sb3_cchain.zoo", *self.arguments]
+            return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+
+    def returns(self) -> list[dict[str, float]]:
+        """
+        :return: Rows of the run's CSV file so far
+        """
+        files = list(self.folder.glob(f"tensorboard/*/*/{RETURNS_CSV}"))
+        return read_returns(files[0]) if files else []
+
+    def task_averages(self) -> list[float]:
+        """
+        :return: J(T_i) of each task: mean over rollouts of the mean return of their episodes
+        """
+        by_task = defaultdict(list)
+        for row in self.returns():
+            by_task[row["task_id"]].append(row["mean_return"])
+        return [float(np.mean(by_task[task])) for task in range(self.n_tasks)]
+
+
+def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
+    """
+    Bring all runs to their end, with a progress bar each. Runs that are done are left as they are, so that the same call
+    continues after an interruption.
+
+    :param runs: The runs
+    :param n_jobs: Processes at a time, of one thread each
+    :raises RuntimeError: When a run fails; it names the log
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[status]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    waiting = [run for run in runs if not run.is_done]
+    running: dict[Run, tuple[subprocess.Popen, float]] = {}
+    with Progress(*columns, refresh_per_second=2) as progress:
+        bars = {run: progress.add_task(run.name, total=run.total_steps, start=False, status="") for run in runs}
+        for run in runs:
+            if run.is_done:
+                progress.update(bars[run], completed=run.total_steps, status="done before")
+        try:
+            while waiting or running:
+                while waiting and len(running) < n_jobs:
+                    run = waiting.pop(0)
+                    running[run] = (run.start(), time.time())
+                    progress.start_task(bars[run])
+                time.sleep(0.5)
+                for run, (process, start) in list(running.items()):
+                    if rows := run.returns():
+                        status = f"task {rows[-1]['task_id']:g}, return {rows[-1]['mean_return']:.0f}"
+                        progress.update(bars[run], completed=rows[-1]["timesteps"], status=status)
+                    if process.poll() is None:
+                        continue
+                    del running[run]
+                    if process.returncode != 0:
+                        raise RuntimeError(f"{run.name} failed with exit code {process.returncode}, see {run.folder}/log.txt")
+                    progress.update(bars[run], completed=run.total_steps)
+                    (run.folder / DONE).write_text(json.dumps({"seconds": round(time.time() - start)}))
+        finally:
+            for process, _ in running.values():
+                process.terminate()

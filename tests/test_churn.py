@@ -1,0 +1,212 @@
+"""The torch-only part: divergences, λ, the reducer, the seam."""
+
+import math
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_cchain.churn import (
+    AdaptiveChurnCoefficient,
+    ChurnCoefficient,
+    ChurnReducer,
+    cross_entropy,
+    extra_gradient,
+    make_coefficient,
+    mean_squared_difference,
+)
+
+
+def test_cross_entropy_by_hand():
+    old = th.tensor([[0.5, 0.5], [1.0, 0.0]])
+    new = th.tensor([[0.25, 0.75], [0.5, 0.5]])
+    by_hand = (-(0.5 * math.log(0.25) + 0.5 * math.log(0.75)) - math.log(0.5)) / 2
+    assert cross_entropy(old, new).item() == pytest.approx(by_hand, abs=1e-6)
+
+
+def test_cross_entropy_sums_sub_actions():
+    old = th.tensor([[[0.5, 0.5], [1.0, 0.0]]])
+    new = th.tensor([[[0.25, 0.75], [0.5, 0.5]]])
+    by_hand = -(0.5 * math.log(0.25) + 0.5 * math.log(0.75)) - math.log(0.5)
+    assert cross_entropy(old, new).item() == pytest.approx(by_hand, abs=1e-6)
+
+
+def test_cross_entropy_of_impossible_action_is_finite():
+    assert cross_entropy(th.tensor([[1.0, 0.0]]), th.tensor([[0.0, 1.0]])).item() == pytest.approx(-math.log(1e-8))
+
+
+def test_mean_squared_difference_by_hand():
+    old = th.tensor([[1.0, 2.0], [3.0, 4.0]])
+    new = th.tensor([[1.0, 0.0], [3.0, 5.0]])
+    assert mean_squared_difference(old, new).item() == pytest.approx((0 + 4 + 0 + 1) / 4)
+
+
+def test_adaptive_coefficient_by_hand():
+    coef = AdaptiveChurnCoefficient(target_ratio=100.0, initial=7.0, warmup=2, window=3)
+    assert coef.value == 7.0
+    coef.update(-0.5, 2.0)
+    assert coef.value == 7.0  # still warming up
+    coef.update(0.1, 4.0)
+    assert coef.value == pytest.approx(100 * (0.5 + 0.1) / (2 + 4))
+    coef.update(0.3, 6.0)
+    coef.update(0.2, 1.0)  # the first pair leaves the window
+    assert coef.value == pytest.approx(100 * (0.1 + 0.3 + 0.2) / (4 + 6 + 1))
+    coef.reset()
+    assert coef.value == 7.0
+    coef.update(1.0, 1.0)
+    coef.update(1.0, 1.0)
+    assert coef.value == pytest.approx(100.0)  # nothing from before the reset
+
+
+def test_adaptive_coefficient_minimum_and_vanishing_churn():
+    coef = AdaptiveChurnCoefficient(target_ratio=1.0, warmup=0, minimum=5.0)
+    assert coef.value == 1.0  # no loss seen yet
+    coef.update(1.0, 1.0)
+    assert coef.value == 5.0
+    coef = AdaptiveChurnCoefficient(target_ratio=1.0, warmup=0)
+    coef.update(1.0, 0.0)
+    assert coef.value == pytest.approx(1e8)
+
+
+def test_adaptive_coefficient_state_is_restored():
+    coef = AdaptiveChurnCoefficient(target_ratio=10.0, warmup=1, window=4)
+    for loss in range(1, 7):
+        coef.update(loss, 2 * loss + 1)
+    restored = AdaptiveChurnCoefficient(target_ratio=10.0, warmup=1, window=4)
+    restored.load_state_dict(coef.state_dict())
+    assert restored.value == coef.value
+    for c in (coef, restored):
+        c.update(3.0, 0.1)
+    assert restored.value == coef.value
+
+
+@pytest.mark.parametrize("value, initial, adaptive", [(0.5, 0.5, False), ("0.5", 0.5, False), ("auto", 1, True), ("auto_10", 10, True)])
+def test_churn_coef_is_read_as_ent_coef(value, initial, adaptive):
+    coef = make_coefficient(value, "auto", 1e4, warmup=10, window=50, minimum=0.0)
+    assert isinstance(coef, AdaptiveChurnCoefficient) == adaptive
+    assert coef.value == initial
+    assert not coef.is_zero
+    assert make_coefficient(0, "auto", 1e4, warmup=10, window=50, minimum=0.0).is_zero
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"churn_coef": -1.0}, r"`churn_coef` must be a number greater than or equal to 0, got -1.0"),
+        ({"churn_coef": "auto_-3"}, r"`churn_coef` must be .* got -3.0"),
+        ({"churn_coef": "auto_"}, r"`churn_coef` must be a number, \"auto\", or \"auto_\" .* got ''"),
+        ({"churn_coef": "automatic"}, r"`churn_coef` must be a number, \"auto\""),
+        ({"churn_coef": "high"}, r"`churn_coef` must be a number, \"auto\".*; got 'high'"),
+        ({"churn_coef": None}, r"`churn_coef` must be a number"),
+        ({"churn_coef": float("nan")}, r"`churn_coef` must be .* got nan"),
+        ({"target_ratio": 0.0}, r"`target_churn_ratio` must be a number greater than 0, got 0.0"),
+        ({"target_ratio": -1}, r"`target_churn_ratio` must be a number greater than 0, got -1"),
+        ({"target_ratio": "large"}, r"`target_churn_ratio` must be a number, \"auto\"; got 'large'"),
+        ({"target_ratio": float("inf")}, r"`target_churn_ratio` must be .* got inf"),
+        ({"warmup": -1}, r"`churn_warmup` must be an integer greater than or equal to 0, got -1"),
+        ({"window": 0}, r"`churn_window` must be an integer greater than or equal to 1, got 0"),
+        ({"window": 2.5}, r"`churn_window` must be an integer"),
+        ({"minimum": -0.1}, r"`churn_coef_min` must be a number greater than or equal to 0, got -0.1"),
+    ],
+)
+def test_bad_coefficient_arguments(changed, message):
+    arguments = dict(churn_coef="auto", target_ratio="auto", default_target_ratio=1.0, warmup=10, window=50, minimum=0.0)
+    with pytest.raises(ValueError, match=message):
+        make_coefficient(**{**arguments, **changed})
+
+
+def make_network(seed=0):
+    th.manual_seed(seed)
+    return nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, 2))
+
+
+def test_extra_gradient_is_added_and_removed():
+    network = make_network()
+    optimizer = th.optim.SGD(network.parameters(), lr=0.1)
+    batch, other = th.randn(2, 8, 3)
+    optimizer.zero_grad()
+    (network(batch).mean() + 3 * network(other).pow(2).mean()).backward()
+    written_out = [p.grad.clone() for p in network.parameters()]
+
+    with extra_gradient(optimizer, lambda: (3 * network(other).pow(2).mean()).backward()):
+        optimizer.zero_grad(set_to_none=True)
+        network(batch).mean().backward()
+    assert all(th.equal(p.grad, g) for p, g in zip(network.parameters(), written_out, strict=True))
+    assert "zero_grad" not in vars(optimizer)
+
+    optimizer.zero_grad()
+    assert all(p.grad is None for p in network.parameters())
+
+
+def test_extra_gradients_nest_and_survive_errors():
+    optimizer = th.optim.SGD(make_network().parameters(), lr=0.1)
+    calls = []
+    with extra_gradient(optimizer, lambda: calls.append("outer")):
+        with pytest.raises(RuntimeError), extra_gradient(optimizer, lambda: calls.append("inner")):
+            optimizer.zero_grad()
+            raise RuntimeError
+        optimizer.zero_grad()
+    assert calls == ["outer", "inner", "outer"]
+    assert "zero_grad" not in vars(optimizer)
+
+
+def test_reducer_standalone_against_written_out_loss():
+    """The loop of the class's docstring, against one that keeps a copy of the network."""
+    import copy
+
+    data = th.randn(50, 2, 8, 3, generator=th.Generator().manual_seed(1))
+    network, plain = make_network(), make_network()
+    optimizers = [th.optim.Adam(n.parameters(), lr=1e-2) for n in (network, plain)]
+    reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(5.0))
+    previous, previous_reference = None, None
+    for batch, reference in data:
+        optimizers[0].zero_grad()
+        reducer.backward(reference)
+        network(batch).pow(2).mean().backward()
+        optimizers[0].step()
+
+        loss = plain(batch).pow(2).mean()
+        if previous is not None:
+            loss = loss + 5.0 * (plain(previous_reference) - previous(previous_reference).detach()).pow(2).mean()
+        previous, previous_reference = copy.deepcopy(plain), reference
+        optimizers[1].zero_grad()
+        loss.backward()
+        optimizers[1].step()
+    for ours, theirs in zip(network.parameters(), plain.parameters(), strict=True):
+        assert th.allclose(ours, theirs, atol=1e-6)
+    assert len(reducer.losses) == len(data) - 1  # the first update has no previous one
+    assert not any(True for _ in reducer.parameters())  # the network is not part of its state
+
+
+def test_reducer_state_is_restored():
+    network = make_network()
+    reducer = ChurnReducer(network, mean_squared_difference, AdaptiveChurnCoefficient(1.0))
+    reducer.backward({"a": th.ones(4, 3)}["a"])
+    restored = ChurnReducer(network, mean_squared_difference, AdaptiveChurnCoefficient(1.0))
+    restored.load_state_dict(reducer.state_dict())
+    assert th.equal(restored.reference, reducer.reference)
+    assert th.equal(restored.old_outputs, reducer.old_outputs)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+def test_non_finite_churn_raises_before_the_parameters_are_touched(poison):
+    network = make_network()
+    optimizer = th.optim.SGD(network.parameters(), lr=0.1)
+    reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(1.0))
+    reducer.backward(th.full((4, 3), 1.0))
+    reducer.old_outputs[0] = poison
+    before = [p.clone() for p in network.parameters()]
+    with pytest.raises(ValueError, match="churn loss is (nan|inf)"):
+        optimizer.zero_grad()
+        reducer.backward(th.ones(4, 3))
+        optimizer.step()
+    assert all(th.equal(p, b) for p, b in zip(network.parameters(), before, strict=True))
+
+
+def test_reducer_forgets_reference():
+    network = make_network()
+    reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(1.0))
+    reducer.backward(th.ones(4, 3))
+    reducer.forget_reference()
+    reducer.backward(th.ones(4, 3))
+    assert reducer.losses == []
