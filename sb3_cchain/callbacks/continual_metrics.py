@@ -59,8 +59,8 @@ class ContinualMetrics(BaseCallback):
             self.mean_returns[int(row["task_id"])].append(row["mean_return"])
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            if "episode_return" in info:
+        for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
+            if done:
                 self._finished[info["task_id"]].append(info["episode_return"])
         return True
 

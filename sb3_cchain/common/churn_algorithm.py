@@ -1,7 +1,5 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
-import io
-import pathlib
 from typing import Any
 
 import torch as th
@@ -97,13 +95,18 @@ class ChurnAlgorithm(BaseAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        As in SB3; parameters of the base algorithm, which have no churn history, are accepted too.
+        As in SB3. Parameters of the base algorithm, which have no churn history, are accepted too; and when another kind of
+        λ or another window was asked for on loading, λ starts over.
 
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters()`` returned
         :param exact_match: Whether all parameters must be given
         :param device: Device to load a saved model to
         """
-        if isinstance(load_path_or_dict, (str, pathlib.Path, io.BufferedIOBase)):
-            _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
-        present_state = {"churn_reducer": self.churn_reducer.state_dict()}
-        super().set_parameters({**present_state, **load_path_or_dict}, exact_match, device)
+        params = load_path_or_dict
+        if not isinstance(params, dict):
+            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
+        present = self.churn_reducer.state_dict()
+        state = {**present, **params.get("churn_reducer", {})}
+        if any(th.is_tensor(state[key]) and state[key].shape != getattr(present.get(key), "shape", None) for key in state):
+            state = {**present, "_extra_state": state["_extra_state"]}
+        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)

@@ -19,7 +19,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     ``reset()`` begins the next task. The last task goes on for ever.
 
     The agent sees neither the task nor the switch. For logging, ``info["task_id"]`` is the task that the step was made in,
-    and ``info["episode_return"]``, at the end of an episode, its return before any wrapper touched the rewards.
+    and ``info["episode_return"]`` the return of the episode so far, before any wrapper touched the rewards.
 
     With several environments side by side steps are counted over all of them, so that they switch together:
     :class:`~sb3_cchain.callbacks.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
@@ -35,6 +35,9 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         or tasks whose spaces differ
     :raises ImportError: When the package that a task needs is not installed
     """
+
+    # For `gymnasium.make`, which asks the class; an instance has those of its tasks
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
 
     def __init__(
         self,
@@ -142,9 +145,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         self._total_steps += self._n_envs
         self._episode_return += float(reward)
         truncated = truncated or (not self._pinned and self._due_task() != self._task_id)
-        info = {**info, "task_id": self._task_id}
-        if terminated or truncated:
-            info["episode_return"] = self._episode_return
+        info = {**info, "task_id": self._task_id, "episode_return": self._episode_return}
         return observation, reward, terminated, truncated, info
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:

@@ -46,12 +46,14 @@ class ContinualGymControl(ContinualEnv):
     """
     Continual Gym Control (Section 5.1 and Appendix A.1 of the C-CHAIN paper, after TRAC): a task is the same environment
     with a fixed offset added to every observation, drawn once per task from N(0, σ²) for each dimension. The first task's
-    offset is zero, and episodes are cut at 400 steps in place of the environment's own limit (both as in the released code).
+    offset is zero, as in the released code.
+
+    The environment's own limit of episode steps is lifted. ``gymnasium.make("Continual/...")`` sets one of 400 steps, as in
+    the released code, and takes another as ``max_episode_steps``.
 
     :param env_id: The environment, with ``Box`` observations
     :param n_tasks: Length of the sequence
     :param steps_per_task: Environment steps per task, one number for all or one per task
-    :param max_episode_steps: Length at which an episode is cut
     :param offset_std: σ
     :param offset_seed: Seed of the offsets, which depend on nothing else: not on ``reset(seed=...)``
     :param offsets: The offsets themselves, ``(n_tasks, *observation_shape)``; read back as the attribute ``offsets``
@@ -68,7 +70,6 @@ class ContinualGymControl(ContinualEnv):
         *,
         n_tasks: int = 10,
         steps_per_task: int | Sequence[int] = 160_000,
-        max_episode_steps: int = 400,
         offset_std: float = 2.0,
         offset_seed: int = 0,
         offsets: ArrayLike | None = None,
@@ -78,8 +79,6 @@ class ContinualGymControl(ContinualEnv):
     ):
         if n_tasks < 1:
             raise ValueError(f"`n_tasks` must be at least 1, got {n_tasks!r}")
-        if max_episode_steps < 1:
-            raise ValueError(f"`max_episode_steps` must be at least 1, got {max_episode_steps!r}")
         if offset_std < 0:
             raise ValueError(f"`offset_std` must not be negative, got {offset_std!r}")
         shape = (n_tasks, *_observation_shape(env_id))
@@ -90,7 +89,7 @@ class ContinualGymControl(ContinualEnv):
             self.offsets = np.array(offsets, dtype=np.float32)
             if self.offsets.shape != shape:
                 raise ValueError(f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {self.offsets.shape}")
-        tasks = [partial(_make_task, env_id, offset, max_episode_steps) for offset in self.offsets]
+        tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
         super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
 
 
@@ -102,5 +101,5 @@ def _observation_shape(env_id: str) -> tuple[int, ...]:
     return env.observation_space.shape
 
 
-def _make_task(env_id: str, offset: NDArray, max_episode_steps: int, **kwargs: Any) -> gym.Env:
-    return ObservationOffset(gym.make(env_id, max_episode_steps=max_episode_steps, **kwargs), offset)
+def _make_task(env_id: str, offset: NDArray, **kwargs: Any) -> gym.Env:
+    return ObservationOffset(gym.make(env_id, max_episode_steps=-1, **kwargs), offset)

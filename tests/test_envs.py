@@ -1,0 +1,324 @@
+"""ContinualEnv and the registered environments."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
+from sb3_cchain.envs import ObservationOffset, RewardScale
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from tests.envs import CountEnv, RandomEnv
+
+CONTINUAL_IDS = [f"Continual/{name}" for name in CONTINUAL_ENVS]
+
+
+def three_tasks(steps_per_task=10, **kwargs):
+    """Episodes of seven steps."""
+    return ContinualEnv([lambda name=name, **kw: CountEnv(name, **kw) for name in range(3)], steps_per_task, **kwargs)
+
+
+def walk(env, n_steps):
+    """Task, end of episode and observation of each step."""
+    env.reset(seed=0)
+    steps, length = [], 0
+    for _ in range(n_steps):
+        observation, _, terminated, truncated, info = env.step(0)
+        steps.append((info["task_id"], terminated, truncated, int(observation[0])))
+        length += 1
+        assert info["episode_return"] == length  # one a step
+        if terminated or truncated:
+            env.reset()
+            length = 0
+    return steps
+
+
+def test_a_switch_truncates_the_episode_and_the_next_is_of_the_next_task():
+    steps = walk(three_tasks(), 40)
+    assert [task for task, *_ in steps] == [0] * 10 + [1] * 10 + [2] * 20  # the last goes on
+    assert [i for i, (_, _, truncated, _) in enumerate(steps) if truncated] == [9, 19]
+    assert [i for i, (_, terminated, _, _) in enumerate(steps) if terminated] == [6, 16, 26, 33]
+    assert all(task == observation for task, _, _, observation in steps)  # the observation is the task's own
+
+
+def test_steps_may_differ_between_tasks():
+    assert [task for task, *_ in walk(three_tasks([3, 5, 1]), 12)] == [0] * 3 + [1] * 5 + [2] * 4
+
+
+def test_tasks_as_ids():
+    env = ContinualEnv(["CartPole-v1", "CartPole-v0"], 30)
+    assert env.reset()[1]["task_id"] == 0
+    env.set_clock(30)
+    assert env.reset()[1]["task_id"] == 1
+    assert env.task.spec.id == "CartPole-v0"
+    env.close()
+
+
+def test_one_seed_determines_the_whole_sequence():
+    def observations(seed):
+        env = three_tasks()
+        trace = [env.reset(seed=seed)[0]]
+        for _ in range(30):
+            observation, _, terminated, truncated, _ = env.step(0)
+            trace.append(observation)
+            if terminated or truncated:
+                trace.append(env.reset()[0])
+        return np.array(trace)
+
+    assert np.array_equal(observations(1), observations(1))
+    first, second = observations(1), observations(2)
+    assert all((first[first.astype(int) == task] != second[second.astype(int) == task]).all() for task in range(3))
+
+
+def test_vectorised_environments_are_told_to_switch_together():
+    env = three_tasks(n_envs=5)
+    assert [task for task, *_ in walk(env, 6)] == [0, 0, 1, 1, 2, 2]
+
+
+def test_first_task():
+    env = three_tasks(first_task=1)
+    assert [task for task, *_ in walk(env, 12)] == [1] * 10 + [2] * 2
+
+
+def test_set_task_pins():
+    env = three_tasks()
+    env.set_task(2)
+    assert [task for task, *_ in walk(env, 25)] == [2] * 25
+    env.set_task(0)
+    assert [task for task, *_ in walk(env, 25)] == [0] * 25
+
+
+def test_render_modes():
+    env = three_tasks(render_mode="rgb_array", first_task=2)
+    env.reset()
+    assert (env.render() == 2).all()
+    assert three_tasks().render_mode is None
+
+
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        (([], 10), ValueError, "`tasks` must name at least one task, got an empty list"),
+        (("CartPole-v1", 10), TypeError, "`tasks` must be a list .* got the string 'CartPole-v1'"),
+        (([3], 10), TypeError, r"`tasks\[0\]` must be an environment id or a callable .* got 3"),
+        ((["CartPole-v1"], 0), ValueError, "`steps_per_task` must be positive .* got 0"),
+        ((["CartPole-v1"], -5), ValueError, "`steps_per_task` must be positive .* got -5"),
+        ((["CartPole-v1"], 2.5), ValueError, "`steps_per_task` must be positive whole numbers .* got 2.5"),
+        ((["CartPole-v1"], [10, 10]), ValueError, r"`steps_per_task` must be one number or one per task \(1\), got 2"),
+        ((["CartPole-v1", "CartPole-v1"], [10, 0]), ValueError, r"`steps_per_task` .* got \[10, 0\]"),
+        ((["CartPol-v1"], 10), ValueError, "Unknown environment 'CartPol-v1' .*CartPole"),
+        (
+            (["CartPole-v1", "Acrobot-v1"], 10),
+            ValueError,
+            r"same observation_space, but task 0 \(CartPole-v1\) has Box.*\(4,\).* and task 1 \(Acrobot-v1\) has Box.*\(6,\)",
+        ),
+        (
+            (["CartPole-v1", lambda: TimeLimit(RandomEnv(gym.make("CartPole-v1").observation_space), 5)], 10),
+            ValueError,
+            r"same action_space, but task 0 \(CartPole-v1\) has Discrete\(2\) and task 1 \(RandomEnv\) has Discrete\(3\)",
+        ),
+    ],
+)
+def test_bad_arguments(arguments, error, message):
+    with pytest.raises(error, match=message):
+        ContinualEnv(*arguments)
+
+
+def test_missing_package_says_what_mends_it():
+    def needs_package():
+        raise gym.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
+
+    with pytest.raises(ImportError, match="pip install"):
+        ContinualEnv([needs_package], 10)
+
+
+@pytest.mark.parametrize("call", [lambda env: env.set_task(3), lambda env: env.set_clock(-1), lambda env: env.set_clock(0, 0)])
+def test_bad_clock_and_task(call):
+    with pytest.raises(ValueError, match="must"):
+        call(three_tasks())
+    with pytest.raises(ValueError, match="`first_task` must be between 0 and 2"):
+        three_tasks(first_task=3)
+
+
+# --- Registered environments --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", CONTINUAL_IDS)
+def test_registered_environments_pass_the_checkers(env_id):
+    check_env(gym.make(env_id, steps_per_task=100).unwrapped)
+    sb3_check_env(gym.make(env_id, steps_per_task=100))
+
+
+@pytest.mark.parametrize("env_id", CONTINUAL_IDS)
+def test_defaults_are_the_papers(env_id):
+    env = gym.make(env_id).unwrapped
+    mountain_car = "MountainCar" in env_id
+    assert env.n_tasks == (5 if mountain_car else 10)
+    assert set(env.steps_per_task) == {320_000 if mountain_car else 160_000}
+    assert np.all(env.offsets[0] == 0)
+    assert np.std(env.offsets[1:]) == pytest.approx(0.02 if mountain_car else 2.0, rel=0.5)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id, worst", [("Continual/Acrobot-v1", -400), ("Continual/MountainCar-v0", -400)])
+def test_episodes_are_cut_at_400_steps(env_id, worst):
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    for step in range(1, 401):
+        _, _, terminated, truncated, info = env.step(1)
+        assert not terminated and truncated == (step == 400)
+    assert info["episode_return"] == worst
+    shorter = gym.make(env_id, max_episode_steps=3)
+    shorter.reset()
+    assert [shorter.step(1)[3] for _ in range(3)] == [False, False, True]
+    longer = gym.make(env_id, max_episode_steps=600)  # beyond the environment's own limit
+    longer.reset()
+    assert not any(longer.step(1)[3] for _ in range(599))
+
+
+def test_offsets_have_their_own_seed_and_can_be_read_back_and_passed_in():
+    default = gym.make("Continual/CartPole-v1").unwrapped.offsets
+    env = gym.make("Continual/CartPole-v1")
+    env.reset(seed=123)
+    assert np.array_equal(env.unwrapped.offsets, default)
+    other = gym.make("Continual/CartPole-v1", offset_seed=1).unwrapped.offsets
+    assert not np.array_equal(other[1:], default[1:])
+    passed_in = gym.make("Continual/CartPole-v1", offsets=other).unwrapped
+    assert np.array_equal(passed_in.offsets, other)
+
+    plain, shifted = gym.make("CartPole-v1"), passed_in
+    shifted.set_task(3)
+    assert np.allclose(shifted.reset(seed=5)[0], plain.reset(seed=5)[0] + other[3])
+    assert np.allclose(shifted.step(1)[0], plain.step(1)[0] + other[3])
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"n_tasks": 0}, "`n_tasks` must be at least 1, got 0"),
+        ({"offset_std": -1.0}, "`offset_std` must not be negative, got -1.0"),
+        ({"offsets": np.zeros((10, 3))}, r"`offsets` must have the shape .* = \(10, 4\), got \(10, 3\)"),
+        ({"n_tasks": 2, "offsets": np.zeros((10, 4))}, r"`offsets` must have the shape .* = \(2, 4\), got \(10, 4\)"),
+        ({"env_id": "CartPole-v7"}, "Unknown environment 'CartPole-v7'"),
+        ({"env_id": "FrozenLake-v1"}, "`env_id` must be an environment with Box observations"),
+        ({"steps_per_task": 0}, "`steps_per_task` must be positive"),
+    ],
+)
+def test_bad_arguments_of_gym_control(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("Continual/CartPole-v1", **kwargs)
+
+
+def test_unknown_continual_environment_names_the_nearest():
+    with pytest.raises(gym.error.UnregisteredEnv, match="Acrobot"):
+        gym.make("Continual/Acrobat-v1")
+
+
+def test_offset_wrapper_refuses_what_it_cannot_shift():
+    with pytest.raises(TypeError, match="needs Box observations"):
+        ObservationOffset(RandomEnv(spaces.Discrete(3)), 1.0)
+    with pytest.raises(ValueError, match=r"`offset` must have the observations' shape \(4,\), got \(3,\)"):
+        ObservationOffset(RandomEnv(), np.zeros(3))
+
+
+def test_importing_form_of_the_id():
+    assert gym.make("sb3_cchain:Continual/CartPole-v1").unwrapped.n_tasks == 10
+
+
+# --- In step with training ------------------------------------------------------------------------------------------------
+
+
+class RecordTasks(BaseCallback):
+    """Task of each environment at each step, by total environment steps."""
+
+    def _on_training_start(self):
+        self.tasks = {}
+
+    def _on_step(self):
+        self.tasks[self.num_timesteps] = [info["task_id"] for info in self.locals["infos"]]
+        return True
+
+
+SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=1, device="cpu", seed=0)
+
+
+@pytest.mark.parametrize("vec_env_cls", [None, SubprocVecEnv])
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_vectorised_environments_switch_together_in_total_steps(n_envs, vec_env_cls):
+    env = make_vec_env(three_tasks, n_envs=n_envs, vec_env_cls=vec_env_cls, env_kwargs=dict(steps_per_task=48))
+    record = RecordTasks()
+    CChainPPO("MlpPolicy", env, **SETTINGS).learn(48 * 3, callback=record)
+    env.close()
+    for total_steps, tasks in record.tasks.items():
+        assert tasks == [min((total_steps - n_envs) // 48, 2)] * n_envs, total_steps
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+def test_resumed_training_goes_on_with_the_right_task(tmp_path, normalise):
+    def make_env():
+        env = make_vec_env(three_tasks, env_kwargs=dict(steps_per_task=48))
+        return VecNormalize(env) if normalise else env
+
+    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(64).save(tmp_path / "model")
+    model = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu")
+    record = RecordTasks()
+    model.learn(64, callback=record, reset_num_timesteps=False)
+    assert [record.tasks[step][0] for step in (65, 96, 97, 128)] == [1, 1, 2, 2]
+    # Counting from 0 again begins the sequence again
+    model.learn(16, callback=record)
+    assert record.tasks[16] == [0]
+
+
+class RecordEvaluation(BaseCallback):
+    """Task that the evaluation environment is on after each evaluation."""
+
+    def __init__(self):
+        super().__init__()
+        self.tasks = []
+
+    def _on_step(self):
+        self.tasks.append((self.num_timesteps, self.parent.eval_env.get_attr("task_id")))
+        return True
+
+
+@pytest.mark.parametrize("algorithm", [CChainPPO, PPO])
+@pytest.mark.parametrize("nested", [False, True])
+def test_evaluation_follows_the_task_being_trained(algorithm, nested):
+    recorded = RecordEvaluation()
+    eval_env = make_vec_env(three_tasks, n_envs=2, env_kwargs=dict(steps_per_task=48))
+    evaluate = EvalCallback(eval_env, eval_freq=1 if nested else 12, callback_after_eval=recorded, n_eval_episodes=9, verbose=0)
+    callback = CallbackList([EveryNTimesteps(12, evaluate)]) if nested else evaluate
+    callbacks = [TaskSync(), callback] if algorithm is PPO else callback
+    env = three_tasks(48)
+    algorithm("MlpPolicy", env, **SETTINGS).learn(144, callback=callbacks)
+    # 9 evaluation episodes of 7 steps are more than a task's 48 steps, yet the task is that of training
+    assert recorded.tasks == [(step, [(step - 1) // 48] * 2) for step in range(12, 145, 12)]
+
+
+def test_callbacks_leave_other_environments_alone():
+    model = CChainPPO("MlpPolicy", "CartPole-v1", **SETTINGS)
+    model.learn(32, callback=EvalCallback(gym.make("CartPole-v1"), eval_freq=16, warn=False, verbose=0))
+    assert not any(key.startswith("continual/") for key in model.logger.name_to_value)
+
+
+def test_reward_scale():
+    env = RewardScale(CountEnv(), 0.05)
+    env.reset()
+    assert env.step(0)[1] == pytest.approx(0.05)
+
+
+def test_reset_of_the_coefficient_at_a_switch():
+    arguments = dict(churn_warmup=0, churn_window=50, **SETTINGS)
+    kept = CChainPPO("MlpPolicy", three_tasks(48), **arguments).learn(96)
+    reset = CChainPPO("MlpPolicy", three_tasks(48), reset_churn_coef=True, **arguments).learn(96)
+    # 6 iterations, 3 of them of the second task
+    assert kept.churn_reducer.coefficient.n_seen == 6
+    assert reset.churn_reducer.coefficient.n_seen == 3

@@ -1,0 +1,239 @@
+"""CChainPPO runs wherever PPO does, and says what it does."""
+
+import csv
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from torch import nn
+
+from sb3_cchain import CChainCallback, CChainPPO
+from tests.envs import RandomEnv
+
+SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu")
+CHURN_KEYS = {"churn/policy_churn", "churn/value_churn", "churn/loss", "churn/coef", "churn/relative_loss"}
+
+BOX = spaces.Box(-1, 1, (4,), np.float32)
+IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+
+def learn(env, policy="MlpPolicy", **kwargs):
+    """Two iterations; the second has seen churn from its first update on."""
+    model = CChainPPO(policy, env, **{**SETTINGS, **kwargs})
+    return model.learn(2 * SETTINGS["n_steps"] * model.n_envs)
+
+
+def assert_churn_was_reduced(model):
+    logged = model.logger.name_to_value
+    assert CHURN_KEYS <= set(logged)
+    assert all(np.isfinite(logged[key]) for key in CHURN_KEYS)
+    assert logged["churn/policy_churn"] > 0 and logged["churn/value_churn"] > 0
+
+
+@pytest.mark.parametrize(
+    "action_space",
+    [spaces.Discrete(3), spaces.MultiDiscrete([2, 4]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2,), np.float32)],
+    ids=lambda space: type(space).__name__,
+)
+@pytest.mark.parametrize(
+    "policy, observation_space",
+    [
+        ("MlpPolicy", BOX),
+        ("MlpPolicy", spaces.Discrete(5)),
+        ("CnnPolicy", IMAGE),
+        ("MultiInputPolicy", spaces.Dict({"vector": BOX, "image": IMAGE})),
+    ],
+    ids=["Box", "Discrete", "image", "Dict"],
+)
+def test_spaces(policy, observation_space, action_space):
+    assert_churn_was_reduced(learn(RandomEnv(observation_space, action_space), policy))
+
+
+@pytest.mark.parametrize("squash", [False, True])
+def test_gsde(squash):
+    env = RandomEnv(action_space=spaces.Box(-1, 1, (2,), np.float32))
+    model = learn(env, use_sde=True, sde_sample_freq=4, policy_kwargs=dict(squash_output=squash))
+    assert_churn_was_reduced(model)
+
+
+@pytest.mark.parametrize("vec_env_cls", [None, SubprocVecEnv])
+def test_vectorised_and_normalised(vec_env_cls):
+    env = VecNormalize(make_vec_env(RandomEnv, n_envs=2, vec_env_cls=vec_env_cls))
+    assert_churn_was_reduced(learn(env))
+    env.close()
+
+
+class NormalisedExtractor(BaseFeaturesExtractor):
+    """BatchNorm and dropout, as module and as function."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 8)
+        self.net = nn.Sequential(nn.Linear(4, 8), nn.BatchNorm1d(8), nn.Dropout(0.5))
+
+    def forward(self, observations):
+        return nn.functional.dropout(self.net(observations), training=self.training)
+
+
+def test_batch_norm_and_dropout_act_in_the_churn_loss_as_they_do_in_the_environment():
+    model = learn(RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor))
+    assert_churn_was_reduced(model)
+    # Reference batches neither move the running statistics nor draw from the random numbers of dropout, so that a λ
+    # too small to matter leaves the parameters as PPO's
+    tiny = learn(RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor), churn_coef=1e-30)
+    plain = PPO("MlpPolicy", RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor), **SETTINGS)
+    plain.learn(64)
+    for name, tensor in plain.policy.state_dict().items():
+        assert th.equal(tensor, tiny.policy.state_dict()[name]), name
+
+
+class CountingBuffer(RolloutBuffer):
+    n_gets = 0
+
+    def get(self, batch_size=None):
+        self.n_gets += 1
+        yield from super().get(batch_size)
+
+
+def test_other_arguments_of_ppo():
+    model = learn(
+        RandomEnv(),
+        rollout_buffer_class=CountingBuffer,
+        stats_window_size=3,
+        target_kl=1.0,
+        clip_range_vf=0.2,
+        normalize_advantage=False,
+        learning_rate=lambda progress: 1e-3 * (1 + progress),
+    )
+    assert_churn_was_reduced(model)
+    assert model.rollout_buffer.n_gets == 4
+    assert "get" not in vars(model.rollout_buffer) and "zero_grad" not in vars(model.policy.optimizer)
+    assert model.ep_info_buffer.maxlen == 3
+
+
+def test_positional_arguments_are_those_of_ppo():
+    model = CChainPPO("MlpPolicy", RandomEnv(), 1e-3, 32, 8, device="cpu")
+    assert (model.learning_rate, model.n_steps, model.batch_size) == (1e-3, 32, 8)
+
+
+def test_early_stopping_before_the_first_update():
+    model = learn(RandomEnv(), target_kl=1e-12, learning_rate=1e-2)
+    assert "churn/loss" not in model.logger.name_to_value or np.isfinite(model.logger.name_to_value["churn/loss"])
+    assert len(model.churn_reducer.losses) == 0
+
+
+def test_default_ratio_is_that_of_the_action_space():
+    discrete = CChainPPO("MlpPolicy", RandomEnv(), **SETTINGS)
+    box = CChainPPO("MlpPolicy", RandomEnv(action_space=spaces.Box(-1, 1, (2,), np.float32)), **SETTINGS)
+    assert discrete.churn_reducer.coefficient.target_ratio == 1e4
+    assert box.churn_reducer.coefficient.target_ratio == 0.05
+
+
+def test_adaptive_coefficient_holds_the_ratio():
+    # A window of one iteration: λ of an iteration is set by the losses of the one before
+    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_warmup=1, churn_window=1, ent_coef=0.01, **SETTINGS)
+    model.learn(5 * 32)
+    logged = model.logger.name_to_value
+    base_loss = abs(logged["train/policy_gradient_loss"] + 0.01 * logged["train/entropy_loss"])
+    assert logged["churn/relative_loss"] == pytest.approx(logged["churn/coef"] * logged["churn/loss"] / base_loss, rel=1e-4)
+    coefficient = model.churn_reducer.coefficient
+    assert coefficient.base_losses.item() == pytest.approx(base_loss)
+    assert coefficient.churn_losses.item() == pytest.approx(logged["churn/loss"])
+    assert coefficient.value == pytest.approx(1e4 * base_loss / logged["churn/loss"], rel=1e-4)
+
+
+def test_policy_churn_is_the_kl_divergence():
+    """One update per iteration, so that the logged mean is one number that can be computed from two saved policies."""
+    model = CChainPPO("MlpPolicy", RandomEnv(), n_steps=32, batch_size=16, n_epochs=1, learning_rate=1e-2, seed=0, device="cpu")
+    pairs = []
+
+    def backward(reference, backward=model.churn_reducer.backward):
+        reducer = model.churn_reducer
+        if reducer.reference is not None:
+            with th.no_grad():
+                new = model.policy.get_distribution(reducer.reference).distribution
+            old = th.distributions.Categorical(probs=reducer.old_outputs)
+            pairs.append(th.distributions.kl_divergence(old, new).mean().item())
+        backward(reference)
+
+    model.churn_reducer.backward = backward
+    model.learn(2 * 32)
+    assert model.logger.name_to_value["churn/policy_churn"] == pytest.approx(np.mean(pairs[-2:]), abs=1e-6)
+
+
+def test_tensorboard_name(tmp_path):
+    CChainPPO("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **SETTINGS).learn(32)
+    assert [folder.name for folder in tmp_path.iterdir()] == ["CChainPPO_1"]
+
+
+def test_logs_to_csv(tmp_path):
+    model = CChainPPO("MlpPolicy", RandomEnv(), **SETTINGS)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(3 * 32)
+    with open(tmp_path / "progress.csv", newline="") as file:
+        assert CHURN_KEYS <= set(next(csv.reader(file)))
+
+
+def test_not_a_number_raises_and_leaves_the_parameters_finite():
+    model = learn(RandomEnv())
+    model.churn_reducer.old_outputs.fill_(float("nan"))
+    with pytest.raises(ValueError, match="The churn loss is nan"):
+        model.learn(32)
+    assert all(p.isfinite().all() for p in model.policy.parameters())
+    assert "zero_grad" not in vars(model.policy.optimizer) and "get" not in vars(model.rollout_buffer)
+
+
+@pytest.mark.parametrize(
+    "arguments, name",
+    [
+        ({"churn_coef": -0.5}, "churn_coef"),
+        ({"churn_coef": "sometimes"}, "churn_coef"),
+        ({"target_churn_ratio": 0}, "target_churn_ratio"),
+        ({"target_churn_ratio": "big"}, "target_churn_ratio"),
+        ({"churn_warmup": 1.5}, "churn_warmup"),
+        ({"churn_window": 0}, "churn_window"),
+        ({"churn_coef_min": -1}, "churn_coef_min"),
+    ],
+)
+@pytest.mark.parametrize("make", [lambda **kw: CChainPPO("MlpPolicy", "no environment is made", **kw), CChainCallback])
+def test_bad_churn_arguments(make, arguments, name):
+    with pytest.raises(ValueError, match=f"`{name}`.*got {next(iter(arguments.values()))!r}"):
+        make(**arguments)
+
+
+def test_unknown_arguments_are_refused():
+    with pytest.raises(TypeError, match="churn_coeff"):
+        CChainPPO("MlpPolicy", RandomEnv(), churn_coeff=1.0)
+
+
+def test_callback_on_stock_ppo_equals_cchain_ppo():
+    arguments = dict(target_churn_ratio=1e3, churn_warmup=1, churn_window=3)
+    ours = CChainPPO("MlpPolicy", "CartPole-v1", **arguments, **SETTINGS).learn(4 * 32)
+    stock = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(4 * 32, callback=CChainCallback(**arguments))
+    assert_churn_was_reduced(stock)
+    for name, tensor in ours.policy.state_dict().items():
+        assert th.equal(tensor, stock.policy.state_dict()[name]), name
+    assert "zero_grad" not in vars(stock.policy.optimizer)
+
+
+def test_callback_refuses_other_algorithms():
+    with pytest.raises(TypeError, match="CChainCallback trains PPO, got A2C"):
+        A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callback=CChainCallback())
+    with pytest.raises(TypeError, match="CChainPPO reduces churn by itself"):
+        CChainPPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(10, callback=CChainCallback())
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_cuda():
+    assert_churn_was_reduced(learn(RandomEnv(), device="cuda"))
+
+
+def test_gymnasium_vector_of_tasks_is_left_to_sb3():
+    assert isinstance(CChainPPO("MlpPolicy", gym.make("CartPole-v1"), **SETTINGS), PPO)
