@@ -41,7 +41,7 @@ class DeepCopyPPO(PPO):
         clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
         discrete = isinstance(self.action_space, spaces.Discrete)
 
-        churn_coef = 1.0
+        churn_coef: Any = 1.0
         if len(self.actor_losses) >= self.churn_warmup:
             mean_actor_loss = np.mean(self.actor_losses[-self.churn_window :])
             mean_churn_loss = np.mean(self.churn_losses[-self.churn_window :])
@@ -59,14 +59,14 @@ class DeepCopyPPO(PPO):
                 ratio = th.exp(log_prob - batch.old_log_prob)
                 clipped_ratio = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
                 actor_loss = -th.min(advantages * ratio, advantages * clipped_ratio).mean()
-                actor_loss = actor_loss - self.ent_coef * entropy.mean()
+                actor_loss = actor_loss - self.ent_coef * entropy.mean()  # type: ignore[union-attr]
                 loss = actor_loss + self.vf_coef * F.mse_loss(batch.returns, values.flatten())
                 actor_losses.append(actor_loss.item())
 
                 if self.old_policy is not None:
                     with th.no_grad():
                         old = self.old_policy.get_distribution(self.reference).distribution
-                    new = self.policy.get_distribution(self.reference).distribution
+                    new: Any = self.policy.get_distribution(self.reference).distribution
                     if discrete:
                         churn_loss = -(old.probs * th.log(new.probs + 1e-8)).sum(dim=1).mean()
                     else:

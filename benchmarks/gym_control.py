@@ -7,16 +7,15 @@ Vanilla PPO and C-CHAIN on continual Gym Control: trains, and writes a table and
 import argparse
 from pathlib import Path
 
+from benchmarks.report import LABELS, markdown_table, plot_curves
 from benchmarks.runs import Run, complete
-
-ALGOS = {"ppo": "PPO", "ppo_cchain": "C-CHAIN PPO"}
 
 
 def main() -> None:
     """Parse the command line, train, report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", required=True, help="Environment id")
-    parser.add_argument("--algo", nargs="+", default=list(ALGOS), choices=list(ALGOS), help="Algorithms")
+    parser.add_argument("--algo", nargs="+", default=list(LABELS), choices=list(LABELS), help="Algorithms")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="Seeds of agents and of task offsets")
     parser.add_argument("--n-tasks", type=int, default=10, help="Length of the task sequence")
     parser.add_argument("--steps-per-task", type=int, default=160_000, help="Environment steps per task")
@@ -31,6 +30,12 @@ def main() -> None:
         for algo in args.algo
     ]
     complete(runs, args.jobs)
+
+    runs.sort(key=lambda run: (list(LABELS).index(run.algo), run.seed))
+    (folder / "table.md").write_text(markdown_table(runs) + "\n")
+    plot_curves(runs, folder / "curves.png", args.env)
+    print((folder / "table.md").read_text())
+    print(f"Written: {folder}/table.md, {folder}/curves.png")
 
 
 if __name__ == "__main__":

@@ -80,7 +80,9 @@ def test_adaptive_coefficient_state_is_restored():
     assert restored.value == coef.value
 
 
-@pytest.mark.parametrize("value, initial, adaptive", [(0.5, 0.5, False), ("0.5", 0.5, False), ("auto", 1, True), ("auto_10", 10, True)])
+@pytest.mark.parametrize(
+    "value, initial, adaptive", [(0.5, 0.5, False), ("0.5", 0.5, False), ("auto", 1, True), ("auto_10", 10, True)]
+)
 def test_churn_coef_is_read_as_ent_coef(value, initial, adaptive):
     coef = make_coefficient(value, "auto", 1e4, warmup=10, window=50, minimum=0.0)
     assert isinstance(coef, AdaptiveChurnCoefficient) == adaptive
@@ -196,7 +198,7 @@ def test_non_finite_churn_raises_before_the_parameters_are_touched(poison):
     reducer.backward(th.full((4, 3), 1.0))
     reducer.old_outputs[0] = poison
     before = [p.clone() for p in network.parameters()]
-    with pytest.raises(ValueError, match="churn loss is (nan|inf)"):
+    with pytest.raises(ValueError, match=r"churn loss is (nan|inf)"):
         optimizer.zero_grad()
         reducer.backward(th.ones(4, 3))
         optimizer.step()

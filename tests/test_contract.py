@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import stable_baselines3.ppo.ppo
 import torch as th
-from benchmarks.deepcopy_ppo import DeepCopyPPO
 from stable_baselines3 import PPO
 
+from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainPPO
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.common.policy_outputs import policy_outputs

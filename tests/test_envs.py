@@ -294,7 +294,9 @@ class RecordEvaluation(BaseCallback):
 def test_evaluation_follows_the_task_being_trained(algorithm, nested):
     recorded = RecordEvaluation()
     eval_env = make_vec_env(three_tasks, n_envs=2, env_kwargs=dict(steps_per_task=48))
-    evaluate = EvalCallback(eval_env, eval_freq=1 if nested else 12, callback_after_eval=recorded, n_eval_episodes=9, verbose=0)
+    evaluate = EvalCallback(
+        eval_env, eval_freq=1 if nested else 12, callback_after_eval=recorded, n_eval_episodes=9, verbose=0
+    )
     callback = CallbackList([EveryNTimesteps(12, evaluate)]) if nested else evaluate
     callbacks = [TaskSync(), callback] if algorithm is PPO else callback
     env = three_tasks(48)

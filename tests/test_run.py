@@ -151,7 +151,9 @@ def test_adaptive_coefficient_holds_the_ratio():
 
 def test_policy_churn_is_the_kl_divergence():
     """One update per iteration, so that the logged mean is one number that can be computed from two saved policies."""
-    model = CChainPPO("MlpPolicy", RandomEnv(), n_steps=32, batch_size=16, n_epochs=1, learning_rate=1e-2, seed=0, device="cpu")
+    model = CChainPPO(
+        "MlpPolicy", RandomEnv(), n_steps=32, batch_size=16, n_epochs=1, learning_rate=1e-2, seed=0, device="cpu"
+    )
     pairs = []
 
     def backward(reference, backward=model.churn_reducer.backward):

@@ -1,6 +1,7 @@
 """Callbacks for training in continual environments."""
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
+from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
 from sb3_cchain.callbacks.task_sync import TaskSync
 
-__all__ = ["ContinualMetrics", "TaskSync", "read_returns"]
+__all__ = ["ContinualMetrics", "EpisodicRollouts", "TaskSync", "read_returns"]

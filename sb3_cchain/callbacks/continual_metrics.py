@@ -2,6 +2,7 @@
 
 import csv
 from collections import defaultdict
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +43,9 @@ class ContinualMetrics(BaseCallback):
     def _on_training_start(self) -> None:
         self.mean_returns.clear()
         self._finished.clear()
-        path = self.path
-        if path is None and self.logger.get_dir() is not None:
-            path = Path(self.logger.get_dir()) / RETURNS_CSV
+        path, folder = self.path, self.logger.get_dir()
+        if path is None and folder is not None:
+            path = Path(folder) / RETURNS_CSV
         self._open_path = path
         if path is None:
             return
@@ -77,7 +78,7 @@ class ContinualMetrics(BaseCallback):
         self.logger.record("continual/task_id", task_id)
         self.logger.record("continual/n_switches", task_id)
         if self.mean_returns:
-            self.logger.record("continual/average_performance", np.mean(sum(self.mean_returns.values(), [])))
+            self.logger.record("continual/average_performance", np.mean(list(chain(*self.mean_returns.values()))))
         if self._open_path is not None and rows:
             with open(self._open_path, "a", newline="") as file:
                 csv.writer(file).writerows(rows)

@@ -76,9 +76,7 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
     churn_losses: th.Tensor
     n_seen: th.Tensor
 
-    def __init__(
-        self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0
-    ):
+    def __init__(self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0):
         super().__init__(initial)
         check_number("target_churn_ratio", target_ratio, exclusive=True)
         check_number("churn_warmup", warmup, integer=True)

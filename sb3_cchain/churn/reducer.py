@@ -1,6 +1,6 @@
 """The churn loss of a network against itself one update ago, for any training loop."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -9,7 +9,7 @@ from torch import nn
 from sb3_cchain.churn.coefficient import ChurnCoefficient
 from sb3_cchain.churn.divergence import Divergence
 
-Observations = th.Tensor | Mapping[str, th.Tensor]
+Observations = th.Tensor | dict[str, th.Tensor]
 
 
 class ChurnReducer(nn.Module):
@@ -103,11 +103,7 @@ class ChurnReducer(nn.Module):
         """
         :return: What ``state_dict()`` holds beside the buffers
         """
-        reference = self.reference
-        return {
-            "reference": dict(reference) if isinstance(reference, Mapping) else reference,
-            "old_outputs": self.old_outputs,
-        }
+        return {"reference": self.reference, "old_outputs": self.old_outputs}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """

@@ -11,7 +11,6 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.callbacks.task_sync import TaskSwitch
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
-from sb3_cchain.churn.divergence import Divergence
 
 
 class ChurnAlgorithm(BaseAlgorithm):
@@ -73,7 +72,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         raise NotImplementedError()
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        super()._setup_model()  # type: ignore[safe-super]
         self.churn_reducer = self._make_churn_reducer().to(self.device)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
@@ -102,9 +101,11 @@ class ChurnAlgorithm(BaseAlgorithm):
         :param exact_match: Whether all parameters must be given
         :param device: Device to load a saved model to
         """
-        params = load_path_or_dict
-        if not isinstance(params, dict):
-            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
+        params: Any
+        if isinstance(load_path_or_dict, dict):
+            params = load_path_or_dict
+        else:
+            _, params, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
         present = self.churn_reducer.state_dict()
         state = {**present, **params.get("churn_reducer", {})}
         if any(th.is_tensor(state[key]) and state[key].shape != getattr(present.get(key), "shape", None) for key in state):

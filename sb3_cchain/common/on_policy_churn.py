@@ -23,9 +23,7 @@ from sb3_cchain.common.policy_outputs import (
 )
 
 
-def make_policy_reducer(
-    policy: ActorCriticPolicy, make_coefficient: Callable[[float], ChurnCoefficient]
-) -> ChurnReducer:
+def make_policy_reducer(policy: ActorCriticPolicy, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
     """
     :param policy: An actor-critic policy
     :param make_coefficient: Makes λ, given the default β of the policy's kind of outputs
@@ -56,7 +54,11 @@ class ReferenceBatches:
     def __init__(self, get: Callable[..., Iterator[Any]]):
         self._get = get
 
-    def __call__(self, batch_size: int | None = None) -> Iterator[Any]:
+    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+        """
+        :param batch_size: Minibatch size
+        :return: The minibatches of one epoch
+        """
         minibatches = list(self._get(batch_size))
         self.overlapping |= len(minibatches) == 1
         distance = (len(minibatches) + 1) // 2
@@ -101,7 +103,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
             reducer.backward(references.current)
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
-    rollout_buffer.get = references  # type: ignore[assignment]
+    rollout_buffer.get = references.get  # type: ignore[assignment]
     try:
         with extra_gradient(policy.optimizer, backward):
             yield

@@ -32,7 +32,7 @@ class ObservationOffset(gym.ObservationWrapper):
         self.offset = np.asarray(offset, dtype=space.dtype)
         if self.offset.shape != space.shape:
             raise ValueError(f"`offset` must have the observations' shape {space.shape}, got {self.offset.shape}")
-        self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)  # type: ignore[arg-type]
+        self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)
 
     def observation(self, observation: NDArray) -> NDArray:
         """
@@ -88,7 +88,9 @@ class ContinualGymControl(ContinualEnv):
         else:
             self.offsets = np.array(offsets, dtype=np.float32)
             if self.offsets.shape != shape:
-                raise ValueError(f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {self.offsets.shape}")
+                raise ValueError(
+                    f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {self.offsets.shape}"
+                )
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
         super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
 

@@ -32,6 +32,8 @@ class CChainCallback(BaseCallback):
     :raises ValueError: Naming the argument that is out of its range
     """
 
+    model: PPO
+
     def __init__(
         self,
         churn_coef: float | str = "auto",

@@ -1,0 +1,97 @@
+"""Tables and learning curves of runs."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from benchmarks.runs import Run
+
+LABELS = {"ppo": "PPO", "ppo_cchain": "C-CHAIN PPO"}
+COLORS = {"ppo": "tab:gray", "ppo_cchain": "tab:blue"}
+
+
+def rows_of(run: Run) -> list[str]:
+    """
+    :param run: A finished run
+    :return: Cells: algorithm, seed, average return of each task, mean over the tasks
+    """
+    averages = run.task_averages()
+    return [LABELS[run.algo], str(run.seed), *(f"{average:.0f}" for average in averages), f"{np.mean(averages):.0f}"]
+
+
+def markdown_table(runs: Sequence[Run]) -> str:
+    """
+    :param runs: Finished runs of one environment and length
+    :return: A row per run, and one per algorithm with the mean over its seeds
+    """
+    n_tasks = runs[0].n_tasks
+    header = ["algorithm", "seed", *(f"task {task}" for task in range(n_tasks)), "J(T)"]
+    lines = [header, ["---"] * len(header), *(rows_of(run) for run in runs)]
+    for algo in dict.fromkeys(run.algo for run in runs):
+        averages = np.mean([run.task_averages() for run in runs if run.algo == algo], axis=0)
+        cells = [*(f"{average:.0f}" for average in averages), f"{averages.mean():.0f}"]
+        lines.append([f"**{LABELS[algo]}**", "**mean**", *(f"**{cell}**" for cell in cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def smoothed(values: np.ndarray, window: int) -> np.ndarray:
+    """
+    :param values: A series
+    :param window: Length of the running mean
+    :return: Mean of the last ``window`` values at each point, of fewer at the beginning
+    """
+    sums = np.cumsum(np.insert(values, 0, 0.0))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def plot_curves(runs: Sequence[Run], path: Path, title: str, window: int = 5, note: str = "") -> None:
+    """
+    Draw the return of each rollout against environment steps, a thin line per run, a thick one for the mean over seeds,
+    and the task switches.
+
+    :param runs: Finished runs of one environment and length
+    :param path: PNG file
+    :param title: Title
+    :param window: Rollouts that the running mean goes over, inside a task
+    :param note: Small print under the picture
+    """
+    figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
+    by_algo: Mapping[str, list[Run]] = {algo: [run for run in runs if run.algo == algo] for algo in LABELS}
+    n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
+    for algo, algo_runs in by_algo.items():
+        label: str | None = LABELS[algo] + (f", mean of {len(algo_runs)} seeds" if len(algo_runs) > 1 else "")
+        for task in range(n_tasks):
+            curves = []
+            grid = np.linspace(task * steps_per_task, (task + 1) * steps_per_task, 81)[1:]
+            for run in algo_runs:
+                rows = [row for row in run.returns() if row["task_id"] == task]
+                steps = np.array([row["timesteps"] for row in rows])
+                returns = smoothed(np.array([row["mean_return"] for row in rows]), window)
+                curves.append(np.interp(grid, steps, returns))
+                if len(algo_runs) > 1:
+                    axes.plot(steps, returns, color=COLORS[algo], linewidth=0.6, alpha=0.5)
+            axes.plot(grid, np.mean(curves, axis=0), color=COLORS[algo], linewidth=2.2, label=label)
+            label = None
+    for task in range(n_tasks):
+        middle = (task + 0.5) * steps_per_task
+        axes.text(middle, 1.01, f"task {task}", ha="center", va="bottom", transform=axes.get_xaxis_transform(), color="0.35")
+        if task > 0:
+            axes.axvline(task * steps_per_task, color="0.35", linestyle="--", linewidth=1)
+    axes.set(xlabel="environment steps", ylabel="return per episode", xlim=(0, n_tasks * steps_per_task))
+    axes.set_title(title, pad=20)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k" if value else "0")
+    axes.legend(loc="best", frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    if note:
+        figure.supxlabel(note, fontsize=8, color="0.35")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

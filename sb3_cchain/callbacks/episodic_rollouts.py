@@ -1,0 +1,65 @@
+"""Rollouts, advantages and value targets as in the paper's PPO."""
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+
+class EpisodicRollouts(BaseCallback):
+    """
+    Makes SB3's on-policy algorithms learn from rollouts as the PPO does that the paper's Gym Control experiments are made
+    with (TRAC's code base):
+
+    - each rollout begins with a new episode; the one that was under way is dropped;
+    - advantages are normalised once over the whole rollout, where SB3's PPO does so for each minibatch. Use it with
+      ``normalize_advantage=False``;
+    - the value function is fitted to the discounted return-to-go, where SB3 fits it to the TD(λ) return. The value of the
+      last observation stands for the rest of an episode that was cut.
+    """
+
+    model: OnPolicyAlgorithm
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, OnPolicyAlgorithm):
+            raise TypeError(f"EpisodicRollouts is for on-policy algorithms, got {type(self.model).__name__}")
+        if getattr(self.model, "normalize_advantage", False):
+            raise ValueError("EpisodicRollouts normalises the advantages itself: set `normalize_advantage=False`, got True")
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
+        self.model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
+
+    def _on_rollout_end(self) -> None:
+        buffer = self.model.rollout_buffer
+        advantages = buffer.advantages
+        buffer.advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        buffer.returns = discounted_returns(
+            buffer.rewards,
+            buffer.episode_starts,
+            last_values=self.locals["values"].cpu().numpy().flatten(),
+            last_dones=self.locals["dones"],
+            gamma=self.model.gamma,
+        )
+
+
+def discounted_returns(
+    rewards: np.ndarray, episode_starts: np.ndarray, last_values: np.ndarray, last_dones: np.ndarray, gamma: float
+) -> np.ndarray:
+    """
+    :param rewards: ``(n_steps, n_envs)``
+    :param episode_starts: Whether a step is the first of its episode, ``(n_steps, n_envs)``
+    :param last_values: Value of the observation after the last step, ``(n_envs,)``
+    :param last_dones: Whether the last step ended its episode, ``(n_envs,)``
+    :param gamma: Discount factor
+    :return: Discounted sum of the rewards from each step to the end of its episode, ``(n_steps, n_envs)``
+    """
+    returns = np.zeros_like(rewards)
+    later, continues = last_values, 1.0 - last_dones
+    for step in reversed(range(len(rewards))):
+        later = rewards[step] + gamma * continues * later
+        returns[step] = later
+        continues = 1.0 - episode_starts[step]
+    return returns

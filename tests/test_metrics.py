@@ -1,0 +1,112 @@
+"""Continual metrics: what is logged, what is written, that nothing scales it."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.envs import RewardScale
+from tests.envs import CountEnv
+
+SETTINGS = dict(n_steps=16, batch_size=8, device="cpu", seed=0)
+
+
+def make_env(**kwargs):
+    """Three tasks of 32 steps in episodes of 8 with returns of 8, 16 and 24."""
+    tasks = [lambda reward=reward: CountEnv(length=8, reward=reward) for reward in (1.0, 2.0, 3.0)]
+    return ContinualEnv(tasks, 32, **kwargs)
+
+
+class Spy(BaseCallback):
+    """What was logged at the end of each rollout."""
+
+    def __init__(self):
+        super().__init__()
+        self.logged = []
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        values = self.logger.name_to_value
+        self.logged.append({key.removeprefix("continual/"): values[key] for key in values if key.startswith("continual/")})
+
+
+def test_by_hand(tmp_path):
+    spy = Spy()
+    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)
+    model.set_logger(configure(str(tmp_path), []))
+    model.learn(96, callback=spy)
+    assert [row["task_id"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
+    assert [row["n_switches"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
+    assert [row["mean_return"] for row in spy.logged] == [8, 8, 16, 16, 24, 24]
+    # J(T) so far: mean over the rollouts
+    assert [row["average_performance"] for row in spy.logged] == pytest.approx([8, 8, 32 / 3, 12, 72 / 5, 16])
+    assert [spy.logged[2 * task + 1][f"average_task_{task}"] for task in range(3)] == [8, 16, 24]
+    assert (tmp_path / "returns.csv").read_text().splitlines() == [
+        "timesteps,task_id,n_episodes,mean_return",
+        *("16,0,2,8.0", "32,0,2,8.0", "48,1,2,16.0", "64,1,2,16.0", "80,2,2,24.0", "96,2,2,24.0"),
+    ]
+
+
+def test_neither_scaling_nor_normalisation_touches_the_returns(tmp_path):
+    def scaled():
+        return RewardScale(make_env(), 0.05)
+
+    path = tmp_path / "folder" / "r.csv"
+    env = VecNormalize(make_vec_env(scaled, n_envs=2, wrapper_class=RewardScale, wrapper_kwargs=dict(scale=3.0)))
+    PPO("MlpPolicy", env, **SETTINGS).learn(96, callback=[TaskSync(), ContinualMetrics(path)])
+    # Two environments: 16 of the 32 steps of a task each
+    assert [(row["timesteps"], row["task_id"], row["n_episodes"], row["mean_return"]) for row in read_returns(path)] == [
+        (32, 0, 4, 8.0),
+        (64, 1, 4, 16.0),
+        (96, 2, 4, 24.0),
+    ]
+
+
+def test_a_rollout_across_a_switch_has_a_row_for_each_task(tmp_path):
+    path = tmp_path / "returns.csv"
+    CChainPPO("MlpPolicy", make_env(), n_steps=48, batch_size=8, device="cpu").learn(96, callback=ContinualMetrics(path))
+    assert path.read_text().splitlines()[1:] == ["48,0,4,8.0", "48,1,2,16.0", "96,1,2,16.0", "96,2,4,24.0"]
+
+
+def test_resumed_training_continues_the_file(tmp_path):
+    path = tmp_path / "returns.csv"
+    spy = Spy()
+    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(48, callback=ContinualMetrics(path))
+    model.save(tmp_path / "model")
+    model.learn(16, callback=ContinualMetrics(path), reset_num_timesteps=False)  # lost: not saved
+    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu")
+    loaded.learn(48, callback=[ContinualMetrics(path), spy], reset_num_timesteps=False)
+    assert [row["timesteps"] for row in read_returns(path)] == [16, 32, 48, 64, 80, 96]
+    assert spy.logged[-1]["average_performance"] == 16
+    # From 0 again it is a new file
+    loaded.learn(16, callback=ContinualMetrics(path))
+    assert [row["timesteps"] for row in read_returns(path)] == [16]
+
+
+@pytest.mark.parametrize("algorithm, kwargs", [(A2C, dict(n_steps=16)), (DQN, dict(learning_starts=1000))])
+def test_any_algorithm(tmp_path, algorithm, kwargs):
+    path = tmp_path / "returns.csv"
+    model = algorithm("MlpPolicy", make_env(), device="cpu", **kwargs)
+    model.learn(96, callback=[TaskSync(), ContinualMetrics(path)])
+    rows = read_returns(path)
+    assert [row["task_id"] for row in rows] == sorted(row["task_id"] for row in rows)
+    assert sum(row["n_episodes"] for row in rows) == 12
+    assert np.mean([row["mean_return"] for row in rows]) == 16
+
+
+def test_tensorboard_and_default_place_of_the_file(tmp_path):
+    CChainPPO("MlpPolicy", make_env(), tensorboard_log=str(tmp_path), **SETTINGS).learn(32)
+    assert len(read_returns(tmp_path / "CChainPPO_1" / "returns.csv")) == 2
+
+
+def test_no_logger_folder_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,200 @@
+"""RL Zoo's command line with our algorithms, and the stock one."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from stable_baselines3 import PPO
+
+import sb3_cchain.zoo as zoo
+from sb3_cchain import CChainPPO
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+
+ROOT = Path(__file__).parent.parent
+GYM_CONTROL = ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"]
+SHORT = ["--env-kwargs", "steps_per_task:1600", "--eval-freq", "800", "--num-threads", "1", "--device", "cpu", "--seed", "1"]
+
+
+def run(*command, cwd, ok=True):
+    environment = {**os.environ, "MPLBACKEND": "agg", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run([sys.executable, "-m", *command], cwd=cwd, capture_output=True, text=True, env=environment)
+    assert (result.returncode == 0) == ok, result.stdout + result.stderr
+    return result.stdout + result.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of 3200 steps over two tasks by each algorithm."""
+    folder = tmp_path_factory.mktemp("zoo")
+    for algo in ("ppo", "ppo_cchain"):
+        run(
+            *("sb3_cchain.zoo", "train", "--algo", algo, "--env", "Continual/Acrobot-v1", "-n", "3200"),
+            *("-f", "logs", "-tb", "tb", "--n-eval-envs", "2", *SHORT),
+            cwd=folder,
+        )
+    return folder
+
+
+@pytest.mark.parametrize("algo, cls", [("ppo", PPO), ("ppo_cchain", CChainPPO)])
+def test_train_finds_our_hyperparameters(trained, algo, cls):
+    folder = trained / "logs" / algo / "Continual-Acrobot-v1_1"
+    model = cls.load(folder / "Continual-Acrobot-v1.zip", device="cpu")
+    assert (model.n_steps, model.batch_size, model.n_epochs, model.ent_coef) == (800, 32, 5, 0.01)
+    assert model.policy.mlp_extractor.policy_net[1].negative_slope == 0.1
+    assert model.policy.optimizer.defaults["eps"] == 1e-8
+    if algo == "ppo_cchain":
+        assert model.churn_reducer.coefficient.target_ratio == 1e4
+        # Task 0's two iterations were forgotten at the switch
+        assert model.churn_reducer.coefficient.n_seen == 2
+
+
+@pytest.mark.parametrize("algo", ["ppo", "ppo_cchain"])
+def test_a_zoo_run_writes_returns_that_no_reward_scale_touched(trained, algo):
+    (path,) = (trained / "tb").glob(f"*/{'PPO' if algo == 'ppo' else 'CChainPPO'}_1/returns.csv")
+    rows = read_returns(path)
+    assert [(row["timesteps"], row["task_id"]) for row in rows] == [(800, 0), (1600, 0), (2400, 1), (3200, 1)]
+    assert all(-400 <= row["mean_return"] <= -40 for row in rows)
+    monitor = (trained / "logs" / algo / "Continual-Acrobot-v1_1" / "0.monitor.csv").read_text().splitlines()
+    assert monitor[1] == "r,l,t,task_id"
+    assert {line.split(",")[3] for line in monitor[2:]} == {"0", "1"}
+
+
+def test_evaluation_in_a_zoo_run_follows_the_task(tmp_path):
+    """The evaluation environments are the zoo's own; their monitors say which task their episodes were of."""
+    (tmp_path / "spy.py").write_text("""
+import json
+from pathlib import Path
+from stable_baselines3.common import callbacks
+
+evaluate_policy = callbacks.evaluate_policy
+
+def spying_evaluate_policy(model, env, **kwargs):
+    result = evaluate_policy(model, env, **kwargs)
+    with open("tasks.jsonl", "a") as file:
+        file.write(json.dumps([model.num_timesteps, env.get_attr("task_id")]) + chr(10))
+    return result
+
+callbacks.evaluate_policy = spying_evaluate_policy
+import sb3_cchain.zoo
+sb3_cchain.zoo.main()
+""")
+    for algo in ("ppo", "ppo_cchain"):
+        arguments = ("train", "--algo", algo, "--env", "Continual/Acrobot-v1", "-n", "2400", "-f", "logs")
+        run("spy", *arguments, *SHORT, "--env-kwargs", "steps_per_task:800", "--eval-freq", "400", cwd=tmp_path)
+    tasks = [json.loads(line) for line in (tmp_path / "tasks.jsonl").read_text().splitlines()]
+    # The step that ends a task is still of that task
+    assert tasks == [[400, [0]], [800, [0]], [1200, [1]], [1600, [1]], [2000, [2]], [2400, [2]]] * 2
+
+
+def test_enjoy(trained):
+    output = run(
+        *("sb3_cchain.zoo", "enjoy", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-f", "logs", "-n", "801"),
+        *("--no-render", "--device", "cpu", "--env-kwargs", "first_task:1"),
+        cwd=trained,
+    )
+    assert "2 Episodes" in output or "Mean reward" in output
+
+
+def test_continue_training(trained):
+    agent = "logs/ppo_cchain/Continual-Acrobot-v1_1/Continual-Acrobot-v1.zip"
+    output = run(
+        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-n", "800"),
+        *("-f", "logs2", "-i", agent, *SHORT),
+        cwd=trained,
+    )
+    assert "Loading pretrained agent" in output
+
+
+def test_plots(trained):
+    run("sb3_cchain.zoo", "plot_train", "-a", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "-w", "2", cwd=trained)
+    run(
+        *("sb3_cchain.zoo", "all_plots", "-a", "ppo", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "--no-million"),
+        *("-o", "results"),
+        cwd=trained,
+    )
+    arguments = ("-i", "results.pkl", "-l", "PPO", "C-CHAIN", "--skip-timesteps", "-b", "-o", "plot", "--format", "png")
+    run("sb3_cchain.zoo", "plot_from_file", *arguments, cwd=trained)
+    assert (trained / "plot.png").stat().st_size > 1000
+
+
+def test_optimize(tmp_path):
+    run(
+        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-n", "400", "-optimize"),
+        *("--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "-f", "logs", "--no-optim-plots", *SHORT),
+        cwd=tmp_path,
+    )
+    (report,) = tmp_path.glob("logs/ppo_cchain/report_*.csv")
+    header, *trials = report.read_text().splitlines()
+    position = header.split(",").index("params_target_churn_ratio")
+    ratios = [float(trial.split(",")[position]) for trial in trials]
+    assert len(set(ratios)) == 2 and all(1e2 <= ratio <= 1e6 for ratio in ratios)
+
+
+def test_stock_rl_zoo_through_a_callback(tmp_path, trained):
+    run(
+        *("rl_zoo3.train", "--algo", "ppo", "--env", "Continual/Acrobot-v1", "--gym-packages", "sb3_cchain", "-n", "3200"),
+        *("-conf", str(ROOT / "zoo_hyperparams" / "ppo_cchain_callback.yml"), "-f", "logs", "-tb", "tb", *SHORT),
+        cwd=tmp_path,
+    )
+    stock = PPO.load(tmp_path / "logs/ppo/Continual-Acrobot-v1_1/Continual-Acrobot-v1.zip", device="cpu")
+    ours = CChainPPO.load(trained / "logs/ppo_cchain/Continual-Acrobot-v1_1/Continual-Acrobot-v1.zip", device="cpu")
+    for name, tensor in ours.policy.state_dict().items():
+        assert th.equal(tensor, stock.policy.state_dict()[name]), name
+    assert len(read_returns(next((tmp_path / "tb").glob("*/PPO_1/returns.csv")))) == 4
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"]])
+def test_usage(monkeypatch, arguments):
+    monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
+    with pytest.raises(SystemExit, match=r"usage: sb3-cchain {train\|enjoy\|plot_train"):
+        zoo.main()
+
+
+def test_unknown_environment_names_the_nearest(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["sb3-cchain", "train", "--algo", "ppo_cchain", "--env", "Continual/Acrobat-v1"])
+    with pytest.raises(ValueError, match="you maybe meant Continual/Acrobot-v1"):
+        zoo.main()
+
+
+# --- The YAML files -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algo", ["ppo", "ppo_cchain"])
+def test_every_environment_has_settings(algo):
+    settings = yaml.safe_load(zoo.hyperparams_file(algo, "Continual/Acrobot-v1").read_text())
+    assert {f"Continual/{name}" for name in CONTINUAL_ENVS} | {"default"} <= set(settings)
+
+
+def test_c_chain_and_vanilla_differ_in_the_churn_arguments_alone():
+    ppo, cchain = (yaml.safe_load(zoo.hyperparams_file(algo, GYM_CONTROL[0]).read_text()) for algo in ("ppo", "ppo_cchain"))
+    callback = yaml.safe_load((zoo.hyperparams_folder() / "ppo_cchain_callback.yml").read_text())
+    for env_id in GYM_CONTROL:
+        churn = {key: value for key, value in cchain[env_id].items() if "churn" in key}
+        assert cchain[env_id] == {**ppo[env_id], **churn}
+        assert churn["target_churn_ratio"] == 1e4
+    settings = callback["Continual/Acrobot-v1"]
+    assert settings["callback"].pop() == {"sb3_cchain.CChainCallback": churn}
+    assert settings == ppo["Continual/Acrobot-v1"]
+
+
+def test_rl_zoos_own_settings_hold_where_we_have_none():
+    assert zoo.hyperparams_file("ppo", "CartPole-v1") is None
+    assert zoo.hyperparams_file("sac", "Continual/Acrobot-v1") is None
+    assert zoo.hyperparams_file("ppo_cchain", "CartPole-v1").name == "ppo_cchain.yml"
+
+
+def test_search_space_depends_on_the_actions():
+    import optuna
+
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for n_actions, low, high in ((0, 1e2, 1e6), (2, 5e-3, 5.0)):
+        ratios = [zoo.sample_ppo_cchain_params(study.ask(), n_actions, 1, {})["target_churn_ratio"] for _ in range(20)]
+        assert low <= min(ratios) < max(ratios) <= high
+        assert np.ptp(np.log10(ratios)) > 1
