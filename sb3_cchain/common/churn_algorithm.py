@@ -110,4 +110,4 @@ class ChurnAlgorithm(BaseAlgorithm):
         state = {**present, **params.get("churn_reducer", {})}
         if any(th.is_tensor(state[key]) and state[key].shape != getattr(present.get(key), "shape", None) for key in state):
             state = {**present, "_extra_state": state["_extra_state"]}
-        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)
+        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)  # type: ignore[dict-item]

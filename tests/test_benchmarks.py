@@ -1,0 +1,67 @@
+"""The benchmarks' own machinery."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.report import markdown_table, plot_curves, smoothed
+from benchmarks.runs import DONE, Run, complete
+
+CSV = "timesteps,task_id,n_episodes,mean_return\n"
+
+
+def make_run(folder, algo="ppo", seed=0, rows="800,0,2,-10.0\n1600,0,2,-20.0\n2400,1,2,-30.0\n3200,1,2,-50.0\n"):
+    run = Run(algo, "Continual/Acrobot-v1", seed, 2, 1600, folder / f"{algo}_{seed}")
+    logged = run.folder / "tensorboard" / "Continual-Acrobot-v1" / "PPO_1"
+    logged.mkdir(parents=True)
+    (logged / "returns.csv").write_text(CSV + rows)
+    return run
+
+
+def test_task_averages_by_hand(tmp_path):
+    assert make_run(tmp_path).task_averages() == [-15.0, -40.0]
+
+
+def test_table_by_hand(tmp_path):
+    runs = [
+        make_run(tmp_path),
+        make_run(tmp_path, seed=1, rows="800,0,1,-5.0\n2400,1,1,0.0\n"),
+        make_run(tmp_path, "ppo_cchain"),
+    ]
+    assert markdown_table(runs).splitlines() == [
+        "| algorithm | seed | task 0 | task 1 | J(T) |",
+        "| --- | --- | --- | --- | --- |",
+        "| PPO | 0 | -15 | -40 | -28 |",
+        "| PPO | 1 | -5 | 0 | -2 |",
+        "| C-CHAIN PPO | 0 | -15 | -40 | -28 |",
+        "| **PPO** | **mean** | **-10** | **-20** | **-15** |",
+        "| **C-CHAIN PPO** | **mean** | **-15** | **-40** | **-28** |",
+    ]
+
+
+def test_smoothed_by_hand():
+    assert smoothed(np.array([1.0, 3.0, 8.0, 1.0]), window=2).tolist() == [1.0, 2.0, 5.5, 4.5]
+
+
+def test_plot(tmp_path):
+    plot_curves([make_run(tmp_path), make_run(tmp_path, "ppo_cchain")], tmp_path / "new" / "curves.png", "title")
+    assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_runs_are_completed_and_not_repeated(tmp_path):
+    run = Run("ppo_cchain", "Continual/CartPole-v1", 0, 2, 800, tmp_path / "run")
+    complete([run], n_jobs=1)
+    assert run.is_done and [row["timesteps"] for row in run.returns()] == [800, 1600]
+    written = (run.folder / DONE).stat().st_mtime_ns
+    assert json.loads((run.folder / DONE).read_text())["seconds"] > 0
+    complete([run], n_jobs=1)
+    assert (run.folder / DONE).stat().st_mtime_ns == written
+
+
+def test_a_failed_run_names_its_log(tmp_path):
+    run = Run("ppo", "Continual/Acrobat-v1", 0, 2, 800, tmp_path / "run")
+    with pytest.raises(RuntimeError, match=r"Continual/Acrobat-v1 ppo seed 0 failed with exit code 1, see .*log.txt"):
+        complete([run], n_jobs=1)
+    assert "you maybe meant Continual/Acrobot-v1" in (run.folder / "log.txt").read_text()
+    assert not run.is_done
