@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -112,16 +113,22 @@ def test_continue_training(trained):
     assert "Loading pretrained agent" in output
 
 
-def test_plots(trained):
-    run("sb3_cchain.zoo", "plot_train", "-a", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "-w", "2", cwd=trained)
+def test_plots(trained, tmp_path):
+    # RL Zoo compares algorithms of several runs each
+    for algo in ("ppo", "ppo_cchain"):
+        for number in (1, 2):
+            shutil.copytree(
+                trained / "logs" / algo / "Continual-Acrobot-v1_1", tmp_path / "logs" / algo / f"Continual-Acrobot-v1_{number}"
+            )
+    run("sb3_cchain.zoo", "plot_train", "-a", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "-w", "2", cwd=tmp_path)
     run(
         *("sb3_cchain.zoo", "all_plots", "-a", "ppo", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "--no-million"),
         *("-o", "results"),
-        cwd=trained,
+        cwd=tmp_path,
     )
     arguments = ("-i", "results.pkl", "-l", "PPO", "C-CHAIN", "--skip-timesteps", "-b", "-o", "plot", "--format", "png")
-    run("sb3_cchain.zoo", "plot_from_file", *arguments, cwd=trained)
-    assert (trained / "plot.png").stat().st_size > 1000
+    run("sb3_cchain.zoo", "plot_from_file", *arguments, cwd=tmp_path)
+    assert (tmp_path / "plot.png").stat().st_size > 1000
 
 
 def test_optimize(tmp_path):
