@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
@@ -49,7 +49,7 @@ class Run:
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.env_id} {self.algo} seed {self.seed}"
+        return f"{self.env_id.removeprefix('Continual/')} {self.algo} seed {self.seed}"
 
     @property
     def arguments(self) -> list[str]:
@@ -108,11 +108,10 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
     """
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[status]}"),
-        TimeElapsedColumn(),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[status]}"),
     )
     waiting = [run for run in runs if not run.is_done]
     running: dict[Run, tuple[subprocess.Popen, float]] = {}

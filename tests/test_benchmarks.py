@@ -61,7 +61,7 @@ def test_runs_are_completed_and_not_repeated(tmp_path):
 
 def test_a_failed_run_names_its_log(tmp_path):
     run = Run("ppo", "Continual/Acrobat-v1", 0, 2, 800, tmp_path / "run")
-    with pytest.raises(RuntimeError, match=r"Continual/Acrobat-v1 ppo seed 0 failed with exit code 1, see .*log.txt"):
+    with pytest.raises(RuntimeError, match=r"Acrobat-v1 ppo seed 0 failed with exit code 1, see .*log.txt"):
         complete([run], n_jobs=1)
     assert "you maybe meant Continual/Acrobot-v1" in (run.folder / "log.txt").read_text()
     assert not run.is_done
