@@ -67,6 +67,8 @@ def plot_curves(runs: Sequence[Run], path: Path, title: str, window: int = 5, no
     by_algo: Mapping[str, list[Run]] = {algo: [run for run in runs if run.algo == algo] for algo in LABELS}
     n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
     for algo, algo_runs in by_algo.items():
+        if not algo_runs:
+            continue
         label: str | None = LABELS[algo] + (f", mean of {len(algo_runs)} seeds" if len(algo_runs) > 1 else "")
         for task in range(n_tasks):
             curves = []

@@ -1,22 +1,25 @@
 """Training runs as processes: each is the command that a user would type, and is never repeated once it is done."""
 
 import json
+import math
 import os
 import shlex
 import shutil
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import yaml
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from sb3_cchain.callbacks import read_returns
-from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
+from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV, task_averages
+from sb3_cchain.zoo import hyperparams_folder
 
 DONE = "done.json"
 
@@ -63,8 +66,19 @@ class Run:
 
     @property
     def is_done(self) -> bool:
-        """Whether the run came to its end."""
-        return (self.folder / DONE).exists()
+        """Whether the run came to its end, with the present settings."""
+        path = self.folder / DONE
+        return path.exists() and json.loads(path.read_text())["settings"] == self.settings
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What determines the run: its hyperparameters and versions."""
+        hyperparameters = yaml.safe_load((hyperparams_folder() / f"{self.algo}.yml").read_text())
+        return {
+            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task],
+            "hyperparameters": hyperparameters.get(self.env_id),
+            "versions": {name: version(name) for name in ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")},
+        }
 
     def start(self) -> subprocess.Popen:
         """
@@ -91,10 +105,8 @@ class Run:
         """
         :return: J(T_i) of each task: mean over rollouts of the mean return of their episodes
         """
-        by_task = defaultdict(list)
-        for row in self.returns():
-            by_task[row["task_id"]].append(row["mean_return"])
-        return [float(np.mean(by_task[task])) for task in range(self.n_tasks)]
+        averages = task_averages(self.returns())
+        return [averages.get(task, math.nan) for task in range(self.n_tasks)]
 
 
 def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
@@ -137,7 +149,9 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
                     if process.returncode != 0:
                         raise RuntimeError(f"{run.name} failed with exit code {process.returncode}, see {run.folder}/log.txt")
                     progress.update(bars[run], completed=run.total_steps)
-                    (run.folder / DONE).write_text(json.dumps({"seconds": round(time.time() - start)}))
+                    (run.folder / DONE).write_text(
+                        json.dumps({"seconds": round(time.time() - start), "settings": run.settings}, indent=1)
+                    )
         finally:
             for process, _ in running.values():
                 process.terminate()

@@ -77,14 +77,14 @@ def main() -> None:
         sys.exit(f"usage: sb3-cchain {{{'|'.join(commands)}}} ...\nThe options are those of RL Zoo: sb3-cchain train --help")
     register_algorithms()
     if sys.argv[1] == "train":
-        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser = argparse.ArgumentParser(add_help=False)
         parser.add_argument("--algo", default="ppo")
         parser.add_argument("--env", default="CartPole-v1")
-        parser.add_argument("-conf", "--conf-file")
         given, _ = parser.parse_known_args(sys.argv[2:])
         ours = hyperparams_file(given.algo, given.env)
-        if given.conf_file is None and ours is not None:
-            sys.argv += ["--conf-file", str(ours)]
+        if ours is not None:
+            # First, so that a file given by the user wins
+            sys.argv[2:2] = ["--conf-file", str(ours)]
     rl_zoo3.cli.main()
 
 

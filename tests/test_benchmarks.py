@@ -45,8 +45,11 @@ def test_smoothed_by_hand():
 
 
 def test_plot(tmp_path):
-    plot_curves([make_run(tmp_path), make_run(tmp_path, "ppo_cchain")], tmp_path / "new" / "curves.png", "title")
-    assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    runs = [make_run(tmp_path), make_run(tmp_path, "ppo_cchain")]
+    for some in (runs, runs[:1]):
+        plot_curves(some, tmp_path / "new" / "curves.png", "title")
+        assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
+        (tmp_path / "new" / "curves.png").unlink()
 
 
 def test_runs_are_completed_and_not_repeated(tmp_path):
@@ -57,6 +60,11 @@ def test_runs_are_completed_and_not_repeated(tmp_path):
     assert json.loads((run.folder / DONE).read_text())["seconds"] > 0
     complete([run], n_jobs=1)
     assert (run.folder / DONE).stat().st_mtime_ns == written
+    # Made with other settings, it does not count as done
+    done = json.loads((run.folder / DONE).read_text())
+    done["settings"]["hyperparameters"]["learning_rate"] = 1.0
+    (run.folder / DONE).write_text(json.dumps(done))
+    assert not run.is_done
 
 
 def test_a_failed_run_names_its_log(tmp_path):

@@ -96,7 +96,10 @@ def test_churn_coef_is_read_as_ent_coef(value, initial, adaptive):
     [
         ({"churn_coef": -1.0}, r"`churn_coef` must be a number greater than or equal to 0, got -1.0"),
         ({"churn_coef": "auto_-3"}, r"`churn_coef` must be .* got -3.0"),
-        ({"churn_coef": "auto_"}, r"`churn_coef` must be a number, \"auto\", or \"auto_\" .* got ''"),
+        ({"churn_coef": "auto_"}, r"`churn_coef` must be a number, \"auto\", or \"auto_\" .* got 'auto_'"),
+        ({"churn_coef": "auto_ten"}, r"`churn_coef` must be a number, .* got 'auto_ten'"),
+        ({"churn_coef": True}, r"`churn_coef` must be a number, .* got True"),
+        ({"window": True}, r"`churn_window` must be an integer .* got True"),
         ({"churn_coef": "automatic"}, r"`churn_coef` must be a number, \"auto\""),
         ({"churn_coef": "high"}, r"`churn_coef` must be a number, \"auto\".*; got 'high'"),
         ({"churn_coef": None}, r"`churn_coef` must be a number"),
@@ -115,6 +118,13 @@ def test_bad_coefficient_arguments(changed, message):
     arguments = dict(churn_coef="auto", target_ratio="auto", default_target_ratio=1.0, warmup=10, window=50, minimum=0.0)
     with pytest.raises(ValueError, match=message):
         make_coefficient(**{**arguments, **changed})
+
+
+def test_numpy_numbers_are_numbers():
+    import numpy as np
+
+    coef = AdaptiveChurnCoefficient(np.float32(2), warmup=np.int32(0), window=np.int64(5), minimum=np.float64(1))
+    assert len(coef.base_losses) == 5
 
 
 def make_network(seed=0):
@@ -183,7 +193,7 @@ def test_reducer_standalone_against_written_out_loss():
 def test_reducer_state_is_restored():
     network = make_network()
     reducer = ChurnReducer(network, mean_squared_difference, AdaptiveChurnCoefficient(1.0))
-    reducer.backward({"a": th.ones(4, 3)}["a"])
+    reducer.backward(th.ones(4, 3))
     restored = ChurnReducer(network, mean_squared_difference, AdaptiveChurnCoefficient(1.0))
     restored.load_state_dict(reducer.state_dict())
     assert th.equal(restored.reference, reducer.reference)

@@ -1,5 +1,7 @@
 """ContinualEnv and the registered environments."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
+from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.envs import ObservationOffset, RewardScale
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 from tests.envs import CountEnv, RandomEnv
@@ -85,6 +89,9 @@ def test_vectorised_environments_are_told_to_switch_together():
 def test_first_task():
     env = three_tasks(first_task=1)
     assert [task for task, *_ in walk(env, 12)] == [1] * 10 + [2] * 2
+    record = RecordTasks()
+    CChainPPO("MlpPolicy", three_tasks(16, first_task=1), **SETTINGS).learn(32, callback=record)
+    assert [record.tasks[step] for step in (1, 16, 17, 32)] == [[1], [1], [2], [2]]
 
 
 def test_set_task_pins():
@@ -108,11 +115,18 @@ def test_render_modes():
         (([], 10), ValueError, "`tasks` must name at least one task, got an empty list"),
         (("CartPole-v1", 10), TypeError, "`tasks` must be a list .* got the string 'CartPole-v1'"),
         (([3], 10), TypeError, r"`tasks\[0\]` must be an environment id or a callable .* got 3"),
-        ((["CartPole-v1"], 0), ValueError, "`steps_per_task` must be positive .* got 0"),
-        ((["CartPole-v1"], -5), ValueError, "`steps_per_task` must be positive .* got -5"),
-        ((["CartPole-v1"], 2.5), ValueError, "`steps_per_task` must be positive whole numbers .* got 2.5"),
-        ((["CartPole-v1"], [10, 10]), ValueError, r"`steps_per_task` must be one number or one per task \(1\), got 2"),
-        ((["CartPole-v1", "CartPole-v1"], [10, 0]), ValueError, r"`steps_per_task` .* got \[10, 0\]"),
+        ((["CartPole-v1"], 0), ValueError, "`steps_per_task` must be an integer greater than or equal to 1, got 0"),
+        ((["CartPole-v1"], -5), ValueError, "`steps_per_task` must be .* got -5"),
+        ((["CartPole-v1"], 2.5), ValueError, "`steps_per_task` must be an integer .* got 2.5"),
+        ((["CartPole-v1"], None), ValueError, "`steps_per_task` must be an integer .* got None"),
+        ((["CartPole-v1"], True), ValueError, "`steps_per_task` must be an integer .* got True"),
+        ((["CartPole-v1"], "many"), ValueError, "`steps_per_task` must be an integer .* got 'many'"),
+        (
+            (["CartPole-v1"], [10, 10]),
+            ValueError,
+            r"`steps_per_task` must be one number or one per task \(1\), got \[10, 10\]",
+        ),
+        ((["CartPole-v1", "CartPole-v1"], [10, 0]), ValueError, r"`steps_per_task\[1\]` .* got 0"),
         ((["CartPol-v1"], 10), ValueError, "Unknown environment 'CartPol-v1' .*CartPole"),
         (
             (["CartPole-v1", "Acrobot-v1"], 10),
@@ -131,19 +145,24 @@ def test_bad_arguments(arguments, error, message):
         ContinualEnv(*arguments)
 
 
-def test_missing_package_says_what_mends_it():
-    def needs_package():
-        raise gym.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
+def test_missing_package_says_what_mends_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    for module in ("lunar_lander", "bipedal_walker", "car_racing", "car_dynamics"):
+        monkeypatch.delitem(sys.modules, f"gymnasium.envs.box2d.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, "gymnasium.envs.box2d", raising=False)
+    with pytest.raises(ImportError, match=r"'LunarLander-v3' needs a package that is not installed: .*pip install"):
+        gym.make("Continual/LunarLander-v3")
 
-    with pytest.raises(ImportError, match="pip install"):
-        ContinualEnv([needs_package], 10)
+
+def test_numpy_numbers_are_numbers():
+    assert three_tasks(np.int64(10), n_envs=np.int32(2), first_task=np.int64(1)).steps_per_task == [10] * 3
 
 
 @pytest.mark.parametrize("call", [lambda env: env.set_task(3), lambda env: env.set_clock(-1), lambda env: env.set_clock(0, 0)])
 def test_bad_clock_and_task(call):
     with pytest.raises(ValueError, match="must"):
         call(three_tasks())
-    with pytest.raises(ValueError, match="`first_task` must be between 0 and 2"):
+    with pytest.raises(ValueError, match="`first_task` must be an integer between 0 and 2, got 3"):
         three_tasks(first_task=3)
 
 
@@ -202,13 +221,18 @@ def test_offsets_have_their_own_seed_and_can_be_read_back_and_passed_in():
 @pytest.mark.parametrize(
     "kwargs, message",
     [
-        ({"n_tasks": 0}, "`n_tasks` must be at least 1, got 0"),
-        ({"offset_std": -1.0}, "`offset_std` must not be negative, got -1.0"),
+        ({"n_tasks": 0}, "`n_tasks` must be an integer greater than or equal to 1, got 0"),
+        ({"n_tasks": "4"}, "`n_tasks` must be an integer .* got '4'"),
+        ({"offset_std": -1.0}, "`offset_std` must be a number greater than or equal to 0, got -1.0"),
+        ({"offset_std": float("nan")}, "`offset_std` must be .* got nan"),
+        ({"offset_seed": -1}, "`offset_seed` must be an integer .* got -1"),
+        ({"offsets": [[1.0], [2.0, 3.0]]}, "`offsets` must be an array of numbers"),
+        ({"n_tasks": 1, "offsets": [[0.0, 0.0, 0.0, float("nan")]]}, "`offsets` must be finite"),
         ({"offsets": np.zeros((10, 3))}, r"`offsets` must have the shape .* = \(10, 4\), got \(10, 3\)"),
         ({"n_tasks": 2, "offsets": np.zeros((10, 4))}, r"`offsets` must have the shape .* = \(2, 4\), got \(10, 4\)"),
         ({"env_id": "CartPole-v7"}, "Unknown environment 'CartPole-v7'"),
         ({"env_id": "FrozenLake-v1"}, "`env_id` must be an environment with Box observations"),
-        ({"steps_per_task": 0}, "`steps_per_task` must be positive"),
+        ({"steps_per_task": 0}, "`steps_per_task` must be an integer"),
     ],
 )
 def test_bad_arguments_of_gym_control(kwargs, message):
@@ -303,6 +327,33 @@ def test_evaluation_follows_the_task_being_trained(algorithm, nested):
     algorithm("MlpPolicy", env, **SETTINGS).learn(144, callback=callbacks)
     # 9 evaluation episodes of 7 steps are more than a task's 48 steps, yet the task is that of training
     assert recorded.tasks == [(step, [(step - 1) // 48] * 2) for step in range(12, 145, 12)]
+
+
+@pytest.mark.parametrize("difference", [dict(n_tasks=3), dict(offset_seed=1)])
+def test_evaluation_on_other_tasks_is_refused(difference):
+    env, eval_env = (gym.make("Continual/CartPole-v1", **{"n_tasks": 2, **kwargs}) for kwargs in ({}, difference))
+    name = "n_tasks" if "n_tasks" in difference else "offsets"
+    with pytest.raises(ValueError, match=f"must have the tasks of the training environment, but `{name}` differs"):
+        CChainPPO("MlpPolicy", env, **SETTINGS).learn(16, callback=EvalCallback(Monitor(eval_env), verbose=0))
+
+
+class HasTaskId(RandomEnv):
+    task_id = "of its own"
+
+
+@pytest.mark.parametrize("callback", [TaskSync, ContinualMetrics])
+def test_environments_that_are_not_continual(callback):
+    CChainPPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16)
+    with pytest.raises(TypeError, match=f"{callback.__name__} is for continual environments"):
+        PPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16, callback=callback())
+
+
+def test_callbacks_of_ones_own_kind_are_not_added_twice():
+    class Mine(ContinualMetrics):
+        pass
+
+    given = with_continual_callbacks(Mine(), make_vec_env(three_tasks))
+    assert [type(callback) for callback in given] == [TaskSync, Mine]
 
 
 def test_callbacks_leave_other_environments_alone():

@@ -45,8 +45,8 @@ def test_by_hand(tmp_path):
     assert [row["task_id"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
     assert [row["n_switches"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
     assert [row["mean_return"] for row in spy.logged] == [8, 8, 16, 16, 24, 24]
-    # J(T) so far: mean over the rollouts
-    assert [row["average_performance"] for row in spy.logged] == pytest.approx([8, 8, 32 / 3, 12, 72 / 5, 16])
+    # J(T) so far: mean over the tasks
+    assert [row["average_performance"] for row in spy.logged] == pytest.approx([8, 8, 12, 12, 16, 16])
     assert [spy.logged[2 * task + 1][f"average_task_{task}"] for task in range(3)] == [8, 16, 24]
     assert (tmp_path / "returns.csv").read_text().splitlines() == [
         "timesteps,task_id,n_episodes,mean_return",
@@ -106,7 +106,13 @@ def test_tensorboard_and_default_place_of_the_file(tmp_path):
     assert len(read_returns(tmp_path / "CChainPPO_1" / "returns.csv")) == 2
 
 
-def test_no_logger_folder_no_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32)
-    assert list(tmp_path.iterdir()) == []
+def test_history_goes_on_over_several_calls_of_learn(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # where SB3's logger goes when it has no folder
+    model, spy = CChainPPO("MlpPolicy", make_env(), **SETTINGS), Spy()
+    for _ in range(3):
+        model.learn(32, callback=spy, reset_num_timesteps=False)
+    assert [row["average_performance"] for row in spy.logged] == [8, 8, 12, 12, 16, 16]
+    assert [row["n_switches"] for row in spy.logged] == [0] * 6  # in this call of learn()
+    assert not list(tmp_path.rglob("returns.csv"))
+    model.save(tmp_path / "model")
+    assert CChainPPO.load(tmp_path / "model", device="cpu").continual_returns == model.continual_returns

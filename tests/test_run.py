@@ -2,7 +2,6 @@
 
 import csv
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -11,11 +10,13 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainCallback, CChainPPO
+from sb3_cchain.common.policy_outputs import policy_outputs
 from tests.envs import RandomEnv
 
 SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu")
@@ -124,9 +125,10 @@ def test_positional_arguments_are_those_of_ppo():
 
 
 def test_early_stopping_before_the_first_update():
-    model = learn(RandomEnv(), target_kl=1e-12, learning_rate=1e-2)
-    assert "churn/loss" not in model.logger.name_to_value or np.isfinite(model.logger.name_to_value["churn/loss"])
-    assert len(model.churn_reducer.losses) == 0
+    model = learn(RandomEnv(), target_kl=-1.0)
+    assert model.policy.optimizer.state_dict()["state"] == {}  # not one update
+    assert not CHURN_KEYS & set(model.logger.name_to_value)
+    assert model.churn_reducer.coefficient.n_seen == 0
 
 
 def test_default_ratio_is_that_of_the_action_space():
@@ -225,6 +227,60 @@ def test_callback_on_stock_ppo_equals_cchain_ppo():
     assert "zero_grad" not in vars(stock.policy.optimizer)
 
 
+def test_callback_leaves_nothing_behind_when_training_fails():
+    callback = CChainCallback()
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(2 * 32, callback=callback)
+    callback.churn_reducer.old_outputs.fill_(float("nan"))
+    with pytest.raises(ValueError, match="The churn loss is nan"):
+        model.learn(32, callback=callback)
+    assert not {"train", "zero_grad", "get"} & {*vars(model), *vars(model.policy.optimizer), *vars(model.rollout_buffer)}
+    model.learn(32)
+
+
+def test_callback_goes_on_with_its_history_and_may_be_given_twice():
+    callback = CChainCallback()
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(2 * 32, callback=callback)
+    model.learn(2 * 32, callback=[callback, CChainCallback()], reset_num_timesteps=False)
+    assert callback.churn_reducer.coefficient.n_seen == 4
+
+
+class TemperedPolicy(ActorCriticPolicy):
+    """Acts by other probabilities than those of its last layer."""
+
+    def _get_action_dist_from_latent(self, latent_pi):
+        return self.action_dist.proba_distribution(action_logits=50 * self.action_net(latent_pi))
+
+
+@pytest.mark.parametrize(
+    "action_space",
+    [spaces.Discrete(3), spaces.MultiDiscrete([2, 4]), spaces.MultiBinary(3), spaces.Box(-1, 1, (2,), np.float32)],
+    ids=lambda space: type(space).__name__,
+)
+def test_outputs_are_those_of_the_distribution(action_space):
+    class SamePolicy(ActorCriticPolicy):
+        def get_distribution(self, obs):
+            return super().get_distribution(obs)
+
+    policies = [CChainPPO(cls, RandomEnv(action_space=action_space), **SETTINGS).policy for cls in ("MlpPolicy", SamePolicy)]
+    observations = th.randn(5, 4)
+    assert th.allclose(*(policy_outputs(policy, observations) for policy in policies))
+
+
+def test_a_policy_with_a_distribution_of_its_own():
+    model = learn(RandomEnv(), policy=TemperedPolicy)
+    assert_churn_was_reduced(model)
+    observations = th.randn(5, 4)
+    acting = model.policy.get_distribution(observations).distribution.probs
+    assert th.allclose(policy_outputs(model.policy, observations), acting)
+
+
+def test_another_policy_put_in_place():
+    model, other = learn(RandomEnv()), learn(RandomEnv(), seed=1)
+    model.policy = other.policy
+    model.learn(32)
+    assert_churn_was_reduced(model)
+
+
 def test_callback_refuses_other_algorithms():
     with pytest.raises(TypeError, match="CChainCallback trains PPO, got A2C"):
         A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callback=CChainCallback())
@@ -235,7 +291,3 @@ def test_callback_refuses_other_algorithms():
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 def test_cuda():
     assert_churn_was_reduced(learn(RandomEnv(), device="cuda"))
-
-
-def test_gymnasium_vector_of_tasks_is_left_to_sb3():
-    assert isinstance(CChainPPO("MlpPolicy", gym.make("CartPole-v1"), **SETTINGS), PPO)

@@ -86,9 +86,22 @@ def test_takes_a_checkpoint_of_ppo(tmp_path):
     model = CChainPPO.load(tmp_path / "ppo", env=make_env(), device="cpu")
     assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), plain.policy.parameters(), strict=True))
     model.learn(64)
+    assert model.churn_reducer.reference is not None
     model.set_parameters(plain.get_parameters())
+    # The churn of the network that was replaced is forgotten
+    assert model.churn_reducer.reference is None and model.churn_reducer.coefficient.n_seen == 0
     model.set_parameters(str(tmp_path / "ppo.zip"))
     assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), plain.policy.parameters(), strict=True))
+
+
+def test_reference_goes_to_the_models_device(tmp_path):
+    """As when a model was saved on a GPU; "meta" stands for the other device."""
+    model = CChainPPO("MultiInputPolicy", make_env(None, DICT), **SETTINGS).learn(32)
+    model.churn_reducer.move_reference("meta")
+    assert model.churn_reducer.old_outputs.is_meta and all(t.is_meta for t in model.churn_reducer.reference.values())
+    vector = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32)
+    vector.churn_reducer.move_reference("meta")
+    assert vector.churn_reducer.reference.is_meta
 
 
 def test_its_policy_loads_without_the_package(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -100,7 +101,11 @@ def test_enjoy(trained):
         *("--no-render", "--device", "cpu", "--env-kwargs", "first_task:1"),
         cwd=trained,
     )
-    assert "2 Episodes" in output or "Mean reward" in output
+    # 801 steps are at least two of at most 400
+    (n_episodes,) = re.findall(r"^(\d+) Episodes", output, flags=re.MULTILINE)
+    assert int(n_episodes) >= 2
+    (mean_reward,) = re.findall(r"^Mean reward: (-?[\d.]+)", output, flags=re.MULTILINE)
+    assert -20 <= float(mean_reward) < 0  # scaled by 1/20
 
 
 def test_continue_training(trained):
@@ -195,6 +200,14 @@ def test_rl_zoos_own_settings_hold_where_we_have_none():
     assert zoo.hyperparams_file("ppo", "CartPole-v1") is None
     assert zoo.hyperparams_file("sac", "Continual/Acrobot-v1") is None
     assert zoo.hyperparams_file("ppo_cchain", "CartPole-v1").name == "ppo_cchain.yml"
+
+
+@pytest.mark.parametrize("option", ["--conf-file", "--conf", "-conf"])
+def test_a_file_of_ones_own_wins(monkeypatch, option):
+    arguments = ["sb3-cchain", "train", "--alg", "ppo_cchain", option, "mine.yml", "--env", "Continual/Acrobot-v1"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(FileNotFoundError, match=r"mine\.yml"):
+        zoo.main()
 
 
 def test_search_space_depends_on_the_actions():

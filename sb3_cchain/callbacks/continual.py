@@ -22,5 +22,6 @@ def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> May
         given = callback
     else:
         given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-    present = {type(c) for c in iterate_callbacks(CallbackList(given))}
-    return [make() for make in (TaskSync, ContinualMetrics) if make not in present] + given
+    present = list(iterate_callbacks(CallbackList(given)))
+    ours = (TaskSync, ContinualMetrics)
+    return [make() for make in ours if not any(isinstance(callback, make) for callback in present)] + given

@@ -28,7 +28,7 @@ def is_continual(env: VecEnv | None) -> bool:
     :param env: A vectorised environment
     :return: Whether it consists of :class:`~sb3_cchain.ContinualEnv`
     """
-    return env is not None and env.has_attr("task_id")
+    return env is not None and env.has_attr("task_id") and env.has_attr("steps_per_task")
 
 
 def iterate_callbacks(callback: BaseCallback | None) -> Iterator[BaseCallback]:
@@ -39,11 +39,28 @@ def iterate_callbacks(callback: BaseCallback | None) -> Iterator[BaseCallback]:
     if callback is None:
         return
     yield callback
-    children = callback.callbacks if isinstance(callback, CallbackList) else []
-    if isinstance(callback, EventCallback) and callback.callback is not None:
-        children = [callback.callback]
+    children: list[BaseCallback | None] = []
+    if isinstance(callback, CallbackList):
+        children += callback.callbacks
+    if isinstance(callback, EventCallback):
+        children += [callback.callback]
+    if isinstance(callback, EvalCallback):
+        children += [callback.callback_on_new_best]
     for child in children:
         yield from iterate_callbacks(child)
+
+
+def require_continual(callback: BaseCallback, env: VecEnv) -> None:
+    """
+    :param callback: A callback for continual environments
+    :param env: The training environment
+    :raises TypeError: When it is not continual
+    """
+    if not is_continual(env):
+        raise TypeError(
+            f"{type(callback).__name__} is for continual environments, but the training environment is not one. "
+            'Make it with gymnasium.make("Continual/...") or sb3_cchain.ContinualEnv.'
+        )
 
 
 class TaskSync(BaseCallback):
@@ -56,6 +73,9 @@ class TaskSync(BaseCallback):
       would count their own few steps and stay on the first task.
 
     ``CChainPPO`` adds it by itself in a continual environment; give it to other algorithms, before any ``EvalCallback``.
+
+    It raises a ``TypeError`` when the training environment is not continual, and a ``ValueError`` when an evaluation
+    environment has other tasks than it.
     """
 
     def _on_training_start(self) -> None:
@@ -65,6 +85,9 @@ class TaskSync(BaseCallback):
             if isinstance(callback, EvalCallback) and is_continual(callback.eval_env)
         ]
         env = self.training_env
+        require_continual(self, env)
+        for eval_env in self._eval_envs:
+            _check_same_tasks(env, eval_env)
         if any(env.env_method("set_clock", self.num_timesteps, env.num_envs)):
             # The environments were reset before they were told the time, into an episode of the wrong task
             self.model._last_obs = env.reset()  # type: ignore[assignment]
@@ -84,3 +107,15 @@ class TaskSync(BaseCallback):
         self._task_id = task_id
         for eval_env in self._eval_envs:
             eval_env.env_method("set_task", task_id)
+
+
+def _check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:
+    for name in ("n_tasks", "offsets"):
+        if env.has_attr(name) and eval_env.has_attr(name):
+            ours, theirs = env.get_attr(name)[0], eval_env.get_attr(name)[0]
+            if not np.array_equal(ours, theirs):
+                raise ValueError(
+                    f"The evaluation environment must have the tasks of the training environment, but `{name}` differs: "
+                    f"{theirs} instead of {ours}. Make both with the same arguments (RL Zoo: give them as --env-kwargs, or "
+                    "repeat those of the YAML file as --eval-env-kwargs)."
+                )

@@ -1,26 +1,9 @@
 """The weight λ of the churn loss: fixed, or set so that the churn loss keeps its ratio to the base loss."""
 
-import math
-
 import torch as th
 from torch import nn
 
-
-def check_number(name: str, value: object, minimum: float = 0.0, exclusive: bool = False, integer: bool = False) -> None:
-    """
-    :param name: The argument's name, for the message
-    :param value: Its value
-    :param minimum: The least value allowed
-    :param exclusive: Whether ``minimum`` itself is forbidden
-    :param integer: Whether the value must be an integer
-    :raises ValueError: Naming argument, value and what is allowed
-    """
-    kind = int if integer else (int, float)
-    if isinstance(value, kind) and math.isfinite(value) and (value > minimum or (value == minimum and not exclusive)):
-        return
-    expected = "an integer" if integer else "a number"
-    bound = "greater than" if exclusive else "greater than or equal to"
-    raise ValueError(f"`{name}` must be {expected} {bound} {minimum:g}, got {value!r}")
+from sb3_cchain.validation import check_number
 
 
 class ChurnCoefficient(nn.Module):
@@ -32,7 +15,7 @@ class ChurnCoefficient(nn.Module):
 
     def __init__(self, initial: float):
         super().__init__()
-        check_number("churn_coef", initial)
+        check_number("churn_coef", initial, minimum=0)
         self.initial = float(initial)
 
     @property
@@ -78,10 +61,10 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
 
     def __init__(self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0):
         super().__init__(initial)
-        check_number("target_churn_ratio", target_ratio, exclusive=True)
-        check_number("churn_warmup", warmup, integer=True)
+        check_number("target_churn_ratio", target_ratio, minimum=0, exclusive=True)
+        check_number("churn_warmup", warmup, minimum=0, integer=True)
         check_number("churn_window", window, minimum=1, integer=True)
-        check_number("churn_coef_min", minimum)
+        check_number("churn_coef_min", minimum, minimum=0)
         self.target_ratio = float(target_ratio)
         self.warmup = warmup
         self.minimum = float(minimum)
@@ -145,24 +128,31 @@ def make_coefficient(
     :raises ValueError: Naming the argument, when it cannot be read or lies outside its range
     """
     adaptive = AdaptiveChurnCoefficient(
-        default_target_ratio if target_ratio == "auto" else _number("target_churn_ratio", target_ratio, '"auto"'),
+        (
+            default_target_ratio
+            if target_ratio == "auto"
+            else _number("target_churn_ratio", target_ratio, target_ratio, '"auto"')
+        ),
         warmup=warmup,
         window=window,
         minimum=minimum,
     )
-    allowed = '"auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
     if isinstance(churn_coef, str) and churn_coef.startswith("auto"):
         if churn_coef != "auto":
-            initial = _number("churn_coef", churn_coef.removeprefix("auto_"), allowed)
-            check_number("churn_coef", initial)
-            adaptive.initial = initial
+            adaptive.initial = _number("churn_coef", churn_coef, churn_coef.removeprefix("auto_"), _CHURN_COEF)
+            check_number("churn_coef", adaptive.initial, minimum=0)
         return adaptive
-    return ChurnCoefficient(_number("churn_coef", churn_coef, allowed))
+    return ChurnCoefficient(_number("churn_coef", churn_coef, churn_coef, _CHURN_COEF))
 
 
-def _number(name: str, value: object, alternatives: str) -> float:
+_CHURN_COEF = '"auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
+
+
+def _number(name: str, value: object, number: object, alternatives: str) -> float:
     # Strings too: that is how numbers come from a command line
     try:
-        return float(value)  # type: ignore[arg-type]
+        if isinstance(number, bool):
+            raise TypeError
+        return float(number)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise ValueError(f"`{name}` must be a number, {alternatives}; got {value!r}") from None

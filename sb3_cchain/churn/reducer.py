@@ -99,6 +99,17 @@ class ChurnReducer(nn.Module):
         """Drop the reference batch: the next update has no churn loss (after the network was replaced, say)."""
         self.reference = self.old_outputs = None
 
+    def move_reference(self, device: th.device | str) -> None:
+        """
+        :param device: Where the network is; the state that was loaded may come from elsewhere
+        """
+        if isinstance(self.reference, dict):
+            self.reference = {key: tensor.to(device) for key, tensor in self.reference.items()}
+        elif self.reference is not None:
+            self.reference = self.reference.to(device)
+        if self.old_outputs is not None:
+            self.old_outputs = self.old_outputs.to(device)
+
     def get_extra_state(self) -> dict[str, Any]:
         """
         :return: What ``state_dict()`` holds beside the buffers

@@ -73,7 +73,7 @@ class ChurnAlgorithm(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
-        self.churn_reducer = self._make_churn_reducer().to(self.device)
+        self.churn_reducer = self._make_churn_reducer()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(with_continual_callbacks(callback, self.env), progress_bar)
@@ -94,8 +94,8 @@ class ChurnAlgorithm(BaseAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        As in SB3. Parameters of the base algorithm, which have no churn history, are accepted too; and when another kind of
-        λ or another window was asked for on loading, λ starts over.
+        As in SB3. Parameters of the base algorithm, which have no churn history, are accepted too: churn reduction starts
+        over. When another kind of λ or another window was asked for on loading, λ starts over.
 
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters()`` returned
         :param exact_match: Whether all parameters must be given
@@ -106,8 +106,10 @@ class ChurnAlgorithm(BaseAlgorithm):
             params = load_path_or_dict
         else:
             _, params, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
-        present = self.churn_reducer.state_dict()
-        state = {**present, **params.get("churn_reducer", {})}
-        if any(th.is_tensor(state[key]) and state[key].shape != getattr(present.get(key), "shape", None) for key in state):
-            state = {**present, "_extra_state": state["_extra_state"]}
-        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)  # type: ignore[dict-item]
+        # Without a history of their own, the parameters are those of a network that has not churned yet
+        fresh = self._make_churn_reducer().state_dict()
+        state = params.get("churn_reducer", fresh)
+        if any(th.is_tensor(state[key]) and state[key].shape != getattr(fresh.get(key), "shape", None) for key in state):
+            state = {**fresh, "_extra_state": state["_extra_state"]}
+        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)
+        self.churn_reducer.move_reference(self.device)

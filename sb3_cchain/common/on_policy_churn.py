@@ -3,13 +3,12 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient
@@ -23,15 +22,19 @@ from sb3_cchain.common.policy_outputs import (
 )
 
 
-def make_policy_reducer(policy: ActorCriticPolicy, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
+def make_policy_reducer(model: OnPolicyAlgorithm, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
     """
-    :param policy: An actor-critic policy
+    :param model: A model, whose policy exists
     :param make_coefficient: Makes λ, given the default β of the policy's kind of outputs
     :return: The reducer of the policy's churn (the paper regularises PPO's policy only, not its value function)
     :raises TypeError: When the policy's action distribution is not supported
     """
-    divergence = policy_divergence(policy)
-    return ChurnReducer(partial(policy_outputs, policy), divergence, make_coefficient(DEFAULT_TARGET_RATIO[divergence]))
+    divergence = policy_divergence(model.policy)
+    return ChurnReducer(
+        lambda observations: policy_outputs(model.policy, observations),
+        divergence,
+        make_coefficient(DEFAULT_TARGET_RATIO[divergence]),
+    )
 
 
 class ReferenceBatches:
@@ -69,6 +72,19 @@ class ReferenceBatches:
 
 
 @contextmanager
+def _replaced(owner: object, name: str, method: Callable) -> Iterator[None]:
+    before = vars(owner).get(name)
+    setattr(owner, name, method)
+    try:
+        yield
+    finally:
+        if before is None:
+            delattr(owner, name)
+        else:
+            setattr(owner, name, before)
+
+
+@contextmanager
 def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
     """
     Run ``model``'s own ``train()`` in this block to train it with churn reduction.
@@ -80,7 +96,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
     - ``churn/relative_loss``: λ·L_churn / \\|L\\|, which an adaptive λ holds near β
     - ``churn/policy_churn``: L_churn less its value were there no churn at all; for discrete actions the
       Kullback-Leibler divergence from the policy before an update to the one after it
-    - ``churn/value_churn``: mean absolute change of the state values by an update (the first of each epoch)
+    - ``churn/value_churn``: mean absolute change of the state values by an update, the first of each epoch that another
+      follows
 
     L is the whole actor loss, clipped surrogate and entropy bonus, averaged over the updates.
 
@@ -103,12 +120,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
             reducer.backward(references.current)
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
-    rollout_buffer.get = references.get  # type: ignore[assignment]
-    try:
-        with extra_gradient(policy.optimizer, backward):
-            yield
-    finally:
-        del rollout_buffer.get
+    with _replaced(rollout_buffer, "get", references.get), extra_gradient(policy.optimizer, backward):
+        yield
 
     if references.overlapping and not reducer.warned_of_overlap:
         reducer.warned_of_overlap = True

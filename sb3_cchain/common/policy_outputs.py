@@ -1,13 +1,15 @@
 """The outputs of an SB3 actor-critic policy whose churn is measured, by kind of action distribution."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
     DiagGaussianDistribution,
+    Distribution,
     MultiCategoricalDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -24,7 +26,6 @@ DEFAULT_TARGET_RATIO: dict[Divergence, float] = {cross_entropy: 1e4, mean_square
 # Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
 _MODE_FREE_PACKAGES = (
     "stable_baselines3.",
-    "sb3_contrib.",
     "sb3_cchain.",
     "torch.nn.modules.activation",
     "torch.nn.modules.container",
@@ -57,8 +58,7 @@ def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
 
 def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
     """
-    What the policy's action distribution is made of, without the distribution, whose construction costs as much as the
-    network.
+    What the policy's action distribution is made of.
 
     :param policy: An actor-critic policy
     :param observations: Batch of observations
@@ -66,18 +66,40 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
         ``MultiDiscrete`` (shorter sub-actions padded with 0) and ``(batch_size, n, 2)`` for ``MultiBinary`` actions;
         means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
     """
+    if _has_own_distribution(type(policy)):
+        return _distribution_outputs(policy.get_distribution(observations))
+    # The same without the distribution, whose construction costs as much as the network
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
     outputs = policy.action_net(policy.mlp_extractor.forward_actor(features))
     distribution = policy.action_dist
     if isinstance(distribution, CategoricalDistribution):
         return outputs.softmax(dim=1)
     if isinstance(distribution, MultiCategoricalDistribution):
-        width = max(distribution.action_dims)
-        logits = outputs.split(tuple(distribution.action_dims), dim=1)
-        return th.stack([F.pad(sub.softmax(dim=1), (0, width - sub.shape[1])) for sub in logits], dim=1)
+        return _stack_padded([logits.softmax(dim=1) for logits in outputs.split(tuple(distribution.action_dims), dim=1)])
     if isinstance(distribution, BernoulliDistribution):
         return th.stack([(-outputs).sigmoid(), outputs.sigmoid()], dim=-1)
     return outputs
+
+
+def _has_own_distribution(policy_class: type[ActorCriticPolicy]) -> bool:
+    return any(
+        getattr(policy_class, name) is not getattr(ActorCriticPolicy, name)
+        for name in ("get_distribution", "_get_action_dist_from_latent")
+    )
+
+
+def _distribution_outputs(distribution: Distribution) -> th.Tensor:
+    inner: Any = distribution.distribution
+    if isinstance(distribution, MultiCategoricalDistribution):
+        return _stack_padded([categorical.probs for categorical in inner])
+    if isinstance(distribution, BernoulliDistribution):
+        return th.stack([1 - inner.probs, inner.probs], dim=-1)
+    return inner.probs if isinstance(distribution, CategoricalDistribution) else inner.mean
+
+
+def _stack_padded(sub_actions: Sequence[th.Tensor]) -> th.Tensor:
+    width = max(probs.shape[1] for probs in sub_actions)
+    return th.stack([F.pad(probs, (0, width - probs.shape[1])) for probs in sub_actions], dim=1)
 
 
 def policy_values(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:

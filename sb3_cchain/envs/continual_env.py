@@ -8,6 +8,8 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType, RenderFrame
 
+from sb3_cchain.validation import check_number
+
 Task = str | Callable[..., gym.Env]
 
 
@@ -29,7 +31,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         given ``render_mode=...`` if and only if one is asked for.
     :param steps_per_task: Environment steps per task, one number for all or one per task
     :param n_envs: How many environments step together with this one, itself included
-    :param first_task: The task to begin with; the steps of the tasks before it count as made
+    :param first_task: The task to begin with; those before it are left out
     :param render_mode: As in :func:`gymnasium.make`
     :raises ValueError: For an empty task list, lengths that are not positive or not one per task, an unknown environment,
         or tasks whose spaces differ
@@ -50,8 +52,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     ):
         tasks = _check_tasks(tasks)
         self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks))
-        if not 0 <= first_task < len(tasks):
-            raise ValueError(f"`first_task` must be between 0 and {len(tasks) - 1} for {len(tasks)} tasks, got {first_task!r}")
+        check_number("first_task", first_task, 0, len(tasks) - 1, integer=True)
         self.tasks = [_make_task(task, render_mode) for task in tasks]
         _check_spaces(self.tasks)
 
@@ -64,8 +65,9 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         self._task_ends = list(accumulate(self.steps_per_task))[:-1]
         self._pinned = False
         self._seeded: set[int] = set()
+        self._first_step = [0, *self._task_ends][first_task]
         self._task_id = first_task
-        self.set_clock(([0, *self._task_ends])[first_task], n_envs)
+        self.set_clock(0, n_envs)
 
     @property
     def task_id(self) -> int:
@@ -89,13 +91,11 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :param total_steps: Environment steps made so far, over all environments
         :param n_envs: Environments that step together with this one, itself included
         :return: Whether the present episode is of another task, so that a ``reset()`` is due
-        :raises ValueError: When a number is negative or there is no environment
+        :raises ValueError: When ``total_steps`` is negative or ``n_envs`` not positive
         """
-        if total_steps < 0 or n_envs < 1:
-            raise ValueError(
-                f"`total_steps` must not be negative and `n_envs` must be at least 1, got {total_steps!r} and {n_envs!r}"
-            )
-        self._total_steps, self._n_envs = total_steps, n_envs
+        check_number("total_steps", total_steps, 0, integer=True)
+        check_number("n_envs", n_envs, 1, integer=True)
+        self._total_steps, self._n_envs = self._first_step + total_steps, n_envs
         self._pinned = False
         return self._due_task() != self._task_id
 
@@ -106,8 +106,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :param task_id: The task, counted from 0
         :raises ValueError: When there is no such task
         """
-        if not 0 <= task_id < self.n_tasks:
-            raise ValueError(f"`task_id` must be between 0 and {self.n_tasks - 1}, got {task_id!r}")
+        check_number("task_id", task_id, 0, self.n_tasks - 1, integer=True)
         self._pinned = True
         self._pinned_task = task_id
 
@@ -175,12 +174,14 @@ def _check_tasks(tasks: Sequence[Task]) -> list[Task]:
 
 
 def _check_steps_per_task(steps_per_task: int | Sequence[int], n_tasks: int) -> list[int]:
-    steps = [steps_per_task] * n_tasks if isinstance(steps_per_task, (int, float)) else list(steps_per_task)
-    if len(steps) != n_tasks:
-        raise ValueError(f"`steps_per_task` must be one number or one per task ({n_tasks}), got {len(steps)}: {steps}")
-    if not all(step == int(step) and step > 0 for step in steps):
-        raise ValueError(f"`steps_per_task` must be positive whole numbers of environment steps, got {steps_per_task!r}")
-    return [int(step) for step in steps]
+    if not isinstance(steps_per_task, Sequence) or isinstance(steps_per_task, str):
+        check_number("steps_per_task", steps_per_task, 1, integer=True)
+        return [int(steps_per_task)] * n_tasks
+    if len(steps_per_task) != n_tasks:
+        raise ValueError(f"`steps_per_task` must be one number or one per task ({n_tasks}), got {steps_per_task!r}")
+    for position, steps in enumerate(steps_per_task):
+        check_number(f"steps_per_task[{position}]", steps, 1, integer=True)
+    return [int(steps) for steps in steps_per_task]
 
 
 def _make_task(task: Task, render_mode: str | None) -> gym.Env:

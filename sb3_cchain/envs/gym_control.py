@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.validation import check_number
 
 
 class ObservationOffset(gym.ObservationWrapper):
@@ -77,22 +78,29 @@ class ContinualGymControl(ContinualEnv):
         first_task: int = 0,
         render_mode: str | None = None,
     ):
-        if n_tasks < 1:
-            raise ValueError(f"`n_tasks` must be at least 1, got {n_tasks!r}")
-        if offset_std < 0:
-            raise ValueError(f"`offset_std` must not be negative, got {offset_std!r}")
+        check_number("n_tasks", n_tasks, 1, integer=True)
+        check_number("offset_std", offset_std, 0)
+        check_number("offset_seed", offset_seed, 0, integer=True)
         shape = (n_tasks, *_observation_shape(env_id))
         if offsets is None:
             self.offsets = np.random.default_rng(offset_seed).normal(0.0, offset_std, shape).astype(np.float32)
             self.offsets[0] = 0.0
         else:
-            self.offsets = np.array(offsets, dtype=np.float32)
-            if self.offsets.shape != shape:
-                raise ValueError(
-                    f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {self.offsets.shape}"
-                )
+            self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
         super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+
+
+def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    try:
+        array = np.array(offsets, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`offsets` must be an array of numbers of the shape {shape}, got {offsets!r}") from error
+    if array.shape != shape:
+        raise ValueError(f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"`offsets` must be finite, got {offsets!r}")
+    return array
 
 
 def _observation_shape(env_id: str) -> tuple[int, ...]:

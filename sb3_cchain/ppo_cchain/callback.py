@@ -1,6 +1,5 @@
 """C-CHAIN for a stock ``PPO``: the form in which the stock ``rl_zoo3`` command reaches it."""
 
-from contextlib import ExitStack
 from functools import partial
 
 from stable_baselines3 import PPO
@@ -20,8 +19,8 @@ class CChainCallback(BaseCallback):
           - sb3_cchain.CChainCallback:
               target_churn_ratio: 1.0e+4
 
-    PPO calls its callbacks right before and right after ``train()``, which is when the churn gradient is attached and
-    detached. Unlike ``CChainPPO``, the saved model does not hold the history of λ: resumed training warms up again.
+    PPO calls its callbacks right before each ``train()``, whose next call is then made with churn reduction. Unlike with
+    ``CChainPPO``, the saved model does not hold the history of λ: training resumed from it warms up again.
 
     :param churn_coef: As for ``CChainPPO``
     :param target_churn_ratio: As for ``CChainPPO``
@@ -55,14 +54,17 @@ class CChainCallback(BaseCallback):
         self._make_coefficient(default_target_ratio=1.0)  # bad values shall fail now
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
-        self._during_train = ExitStack()
+        self._reduced_model: PPO | None = None
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, PPO):
             raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
         if hasattr(self.model, "churn_reducer"):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
-        self.churn_reducer = make_policy_reducer(self.model.policy, self._make_coefficient).to(self.model.device)
+        # Another learn() of the same model goes on with the same λ
+        if self._reduced_model is not self.model:
+            self._reduced_model = self.model
+            self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
 
     def _on_step(self) -> bool:
         if self.reset_churn_coef and self._task_switch.happened(self.locals["infos"]):
@@ -70,11 +72,16 @@ class CChainCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if not self.churn_reducer.coefficient.is_zero:
-            self._during_train.enter_context(reduced_churn(self.model, self.churn_reducer))
+        if self.churn_reducer.coefficient.is_zero:
+            return
+        train = self.model.train
 
-    def _on_rollout_start(self) -> None:
-        self._during_train.close()
+        def train_once() -> None:
+            vars(self.model).pop("train", None)  # first, so that it is gone when train() fails, too
+            with reduced_churn(self.model, self.churn_reducer):
+                train()
+
+        self.model.train = train_once  # type: ignore[method-assign]
 
     def _on_training_end(self) -> None:
-        self._during_train.close()
+        vars(self.model).pop("train", None)

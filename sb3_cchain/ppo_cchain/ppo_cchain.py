@@ -46,7 +46,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
     """
 
     def _make_churn_reducer(self) -> ChurnReducer:
-        return make_policy_reducer(self.policy, self._make_churn_coefficient)
+        return make_policy_reducer(self, self._make_churn_coefficient)
 
     def train(self) -> None:
         """Update the policy with the current rollout, as PPO does, with churn reduction."""

@@ -1,0 +1,39 @@
+"""Checks of arguments, with errors that name the argument, its value and what is allowed."""
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+
+def check_number(
+    name: str,
+    value: Any,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    exclusive: bool = False,
+    integer: bool = False,
+) -> None:
+    """
+    :param name: The argument's name
+    :param value: Its value; NumPy's numbers are numbers, booleans are not
+    :param minimum: The least value allowed
+    :param maximum: The greatest value allowed
+    :param exclusive: Whether ``minimum`` itself is forbidden
+    :param integer: Whether the value must be an integer
+    :raises ValueError: When it is not a finite number in that range
+    """
+    kind = Integral if integer else Real
+    if (
+        isinstance(value, kind)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+        and minimum <= value <= maximum  # type: ignore[operator]
+        and not (exclusive and value == minimum)
+    ):
+        return
+    expected = "an integer" if integer else "a number"
+    if math.isfinite(maximum):
+        expected += f" between {minimum:g} and {maximum:g}"
+    elif math.isfinite(minimum):
+        expected += f" greater than {minimum:g}" if exclusive else f" greater than or equal to {minimum:g}"
+    raise ValueError(f"`{name}` must be {expected}, got {value!r}")
