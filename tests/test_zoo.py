@@ -131,7 +131,7 @@ def test_plots(trained, tmp_path):
         *("-o", "results"),
         cwd=tmp_path,
     )
-    arguments = ("-i", "results.pkl", "-l", "PPO", "C-CHAIN", "--skip-timesteps", "-b", "-o", "plot", "--format", "png")
+    arguments = ("-i", "results.pkl", "-l", "PPO", "C-CHAIN", "--skip-timesteps", "-b", "-o", "plot.png", "--format", "png")
     run("sb3_cchain.zoo", "plot_from_file", *arguments, cwd=tmp_path)
     assert (tmp_path / "plot.png").stat().st_size > 1000
 
