@@ -63,6 +63,7 @@ def plot_curves(runs: Sequence[Run], path: Path, title: str, window: int = 5, no
     :param window: Rollouts that the running mean goes over, inside a task
     :param note: Small print under the picture
     """
+    plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
     figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
     by_algo: Mapping[str, list[Run]] = {algo: [run for run in runs if run.algo == algo] for algo in LABELS}
     n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
@@ -90,7 +91,7 @@ def plot_curves(runs: Sequence[Run], path: Path, title: str, window: int = 5, no
     axes.set(xlabel="environment steps", ylabel="return per episode", xlim=(0, n_tasks * steps_per_task))
     axes.set_title(title, pad=20)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k" if value else "0")
-    axes.legend(loc="best", frameon=False)
+    figure.legend(loc="outside lower center", ncols=len(LABELS), frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     if note:
         figure.supxlabel(note, fontsize=8, color="0.35")

@@ -26,7 +26,7 @@ def cross_entropy(old: th.Tensor, new: th.Tensor) -> th.Tensor:
     :param new: Probabilities after the update, of the same shape
     :return: Mean over the batch
     """
-    return -(old * th.log(new + LOG_EPS)).sum() / len(old)
+    return th.xlogy(old, new + LOG_EPS).sum() / -len(old)
 
 
 def mean_squared_difference(old: th.Tensor, new: th.Tensor) -> th.Tensor:

@@ -55,7 +55,7 @@ class ChurnReducer(nn.Module):
         self.old_outputs: th.Tensor | None = None
         # Since the last `end_iteration()`, one for each update
         self.losses: list[float] = []
-        self.churns: list[float] = []
+        self._compared: list[th.Tensor] = []
 
     def backward(self, reference: Observations) -> None:
         """
@@ -67,6 +67,8 @@ class ChurnReducer(nn.Module):
         :raises ValueError: When the churn loss is NaN or infinite. The parameters have not been touched.
         """
         outputs = self._outputs[0]
+        with th.no_grad():
+            next_old_outputs = outputs(reference)
         if self.reference is not None and self.old_outputs is not None:
             with th.enable_grad():
                 new_outputs = outputs(self.reference)
@@ -77,13 +79,24 @@ class ChurnReducer(nn.Module):
                     f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values. "
                     "The parameters have not been updated. Lower the learning rate or `churn_coef`, or set `max_grad_norm`."
                 )
-            (self.coefficient.value * churn_loss).backward()
-            with th.no_grad():
-                self.churns.append(loss - self.divergence(self.old_outputs, self.old_outputs).item())
+            if not self.losses:  # λ changes between iterations only
+                self._coef = self.coefficient.value
+            (self._coef * churn_loss).backward()
             self.losses.append(loss)
-        self.reference = reference
-        with th.no_grad():
-            self.old_outputs = outputs(reference)
+            self._compared.append(self.old_outputs)
+        self.reference, self.old_outputs = reference, next_old_outputs
+
+    def mean_churn(self) -> float:
+        """
+        :return: Mean over the samples since the last ``end_iteration()`` of the churn loss less its value were there no churn;
+            with the cross-entropy, the Kullback-Leibler divergence KL(old ‖ new). NaN before the second update.
+        """
+        if not self.losses:
+            return float("nan")
+        sizes = [len(outputs) for outputs in self._compared]
+        mean_loss = sum(loss * size for loss, size in zip(self.losses, sizes, strict=True)) / sum(sizes)
+        compared = th.cat(self._compared)
+        return mean_loss - self.divergence(compared, compared).item()
 
     def end_iteration(self, base_loss: float) -> None:
         """
@@ -93,7 +106,7 @@ class ChurnReducer(nn.Module):
         """
         if self.losses:
             self.coefficient.update(base_loss, sum(self.losses) / len(self.losses))
-        self.losses, self.churns = [], []
+        self.losses, self._compared = [], []
 
     def forget_reference(self) -> None:
         """Drop the reference batch: the next update has no churn loss (after the network was replaced, say)."""

@@ -137,7 +137,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
         model.logger.record("churn/loss", churn_loss)
         model.logger.record("churn/coef", coef)
         model.logger.record("churn/relative_loss", coef * churn_loss / (base_loss + 1e-8))
-        model.logger.record("churn/policy_churn", np.mean(reducer.churns))
+        model.logger.record("churn/policy_churn", reducer.mean_churn())
         if value_churns:
             model.logger.record("churn/value_churn", np.mean(value_churns))
         reducer.end_iteration(base_loss)
