@@ -12,8 +12,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.report import LABELS, plot_curves, rows_of
-from benchmarks.runs import Run, complete
+from benchmarks.gym_control import ALGOS, gym_control_run
+from benchmarks.report import plot_curves, row_of
+from benchmarks.runs import complete
 
 ENV_ID = "Continual/Acrobot-v1"
 
@@ -27,30 +28,19 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="Folder of runs and picture")
     args = parser.parse_args()
 
+    folder = args.output / f"{args.n_tasks}x{args.steps_per_task}"
     runs = [
-        Run(
-            algo,
-            ENV_ID,
-            seed,
-            args.n_tasks,
-            args.steps_per_task,
-            args.output / f"{args.n_tasks}x{args.steps_per_task}" / f"{algo}_seed{seed}",
-        )
+        gym_control_run(algo, ENV_ID, seed, args.n_tasks, args.steps_per_task, folder)
         for seed in args.seeds
-        for algo in LABELS
+        for algo in ALGOS
     ]
-    console = Console()
-    console.print(
-        f"{ENV_ID}: {args.n_tasks} tasks of {args.steps_per_task} steps. After each switch the same swing-up is seen through "
-        "observations with another offset. The worst return is -400."
-    )
     complete(runs)
 
     table = Table(
         "algorithm", "seed", *(f"task {task}" for task in range(args.n_tasks)), "J(T)", title="Average return per task"
     )
     for run in runs:
-        table.add_row(*rows_of(run))
+        table.add_row(*row_of(run))
     console.print(table)
     picture = args.output / f"demo_{args.n_tasks}x{args.steps_per_task}_seeds_{'_'.join(map(str, args.seeds))}.png"
     plot_curves(runs, picture, "Continual Acrobot")

@@ -1,7 +1,6 @@
 """Training runs as processes: each is the command that a user would type, and is never repeated once it is done."""
 
 import json
-import math
 import os
 import shlex
 import shutil
@@ -14,11 +13,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from sb3_cchain.callbacks import read_returns
-from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV, task_averages
+from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 from sb3_cchain.zoo import hyperparams_folder
 
 DONE = "done.json"
@@ -31,10 +31,12 @@ class Run:
 
     :param algo: Name of the algorithm on the command line
     :param env_id: Environment id
-    :param seed: Seed of the agent, and of the tasks' offsets: the algorithms meet the same tasks under the same seed
+    :param seed: Seed of the agent
     :param n_tasks: Length of the task sequence
     :param steps_per_task: Environment steps per task
     :param folder: Where the run's files go
+    :param env_kwargs: Further arguments of the environment, as on the command line
+    :param eval_freq: Environment steps between two evaluations (ten greedy episodes of the task being trained), or -1
     """
 
     algo: str
@@ -43,6 +45,8 @@ class Run:
     n_tasks: int
     steps_per_task: int
     folder: Path
+    env_kwargs: tuple[str, ...] = ()
+    eval_freq: int = -1
 
     @property
     def total_steps(self) -> int:
@@ -59,9 +63,10 @@ class Run:
         """The command after ``sb3-cchain``."""
         return [
             *("train", "--algo", self.algo, "--env", self.env_id, "--seed", str(self.seed)),
-            *("--n-timesteps", str(self.total_steps), "--eval-freq", "-1", "--num-threads", "1", "--device", "cpu"),
+            *("--n-timesteps", str(self.total_steps), "--num-threads", "1", "--device", "cpu"),
+            *("--eval-freq", str(self.eval_freq), "--eval-episodes", "10"),
             *("--log-folder", str(self.folder), "--tensorboard-log", str(self.folder / "tensorboard"), "--verbose", "0"),
-            *("--env-kwargs", f"n_tasks:{self.n_tasks}", f"steps_per_task:{self.steps_per_task}", f"offset_seed:{self.seed}"),
+            *("--env-kwargs", f"steps_per_task:{self.steps_per_task}", *self.env_kwargs),
         ]
 
     @property
@@ -75,7 +80,7 @@ class Run:
         """What determines the run: its hyperparameters and versions."""
         hyperparameters = yaml.safe_load((hyperparams_folder() / f"{self.algo}.yml").read_text())
         return {
-            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task],
+            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task, *self.env_kwargs],
             "hyperparameters": hyperparameters.get(self.env_id),
             "versions": {name: version(name) for name in ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")},
         }
@@ -101,12 +106,19 @@ class Run:
         files = list(self.folder.glob(f"tensorboard/*/*/{RETURNS_CSV}"))
         return read_returns(files[0]) if files else []
 
-    def task_averages(self) -> list[float]:
+    def evaluations(self) -> list[dict[str, float]]:
         """
-        :return: J(T_i) of each task: mean over rollouts of the mean return of their episodes
+        :return: For each evaluation so far, environment steps, task and mean return
         """
-        averages = task_averages(self.returns())
-        return [averages.get(task, math.nan) for task in range(self.n_tasks)]
+        files = list(self.folder.glob("*/*/evaluations.npz"))
+        if not files:
+            return []
+        logged = np.load(files[0])
+        return [
+            # The step that ends a task is still of that task
+            {"timesteps": int(steps), "task_id": (int(steps) - 1) // self.steps_per_task, "mean_return": float(np.mean(returns))}
+            for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
+        ]
 
 
 def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:

@@ -1,10 +1,11 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
 from sb3_cchain.callbacks import ContinualMetrics, TaskSync
+from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.envs import ContinualEnv, register_envs
 from sb3_cchain.ppo_cchain import CChainCallback, CChainPPO
 
 __version__ = "0.1.0"
-__all__ = ["CChainCallback", "CChainPPO", "ContinualEnv", "ContinualMetrics", "TaskSync"]
+__all__ = ["CChainCallback", "CChainDQN", "CChainPPO", "ContinualEnv", "ContinualMetrics", "DoubleDQN", "TaskSync"]
 
 register_envs()

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.report import markdown_table, plot_curves, smoothed
+from benchmarks.report import averages_of, markdown_table, plot_curves, smoothed
 from benchmarks.runs import DONE, Run, complete
 
 CSV = "timesteps,task_id,n_episodes,mean_return\n"
@@ -20,7 +20,7 @@ def make_run(folder, algo="ppo", seed=0, rows="800,0,2,-10.0\n1600,0,2,-20.0\n24
 
 
 def test_task_averages_by_hand(tmp_path):
-    assert make_run(tmp_path).task_averages() == [-15.0, -40.0]
+    assert averages_of(make_run(tmp_path)) == [-15.0, -40.0]
 
 
 def test_table_by_hand(tmp_path):
@@ -32,11 +32,11 @@ def test_table_by_hand(tmp_path):
     assert markdown_table(runs).splitlines() == [
         "| algorithm | seed | task 0 | task 1 | J(T) |",
         "| --- | --- | --- | --- | --- |",
-        "| PPO | 0 | -15 | -40 | -28 |",
-        "| PPO | 1 | -5 | 0 | -2 |",
-        "| C-CHAIN PPO | 0 | -15 | -40 | -28 |",
-        "| **PPO** | **mean** | **-10** | **-20** | **-15** |",
-        "| **C-CHAIN PPO** | **mean** | **-15** | **-40** | **-28** |",
+        "| PPO | 0 | -15.0 | -40.0 | -27.5 |",
+        "| PPO | 1 | -5.0 | 0.0 | -2.5 |",
+        "| C-CHAIN PPO | 0 | -15.0 | -40.0 | -27.5 |",
+        "| **PPO** | **mean** | **-10.0** | **-20.0** | **-15.0** |",
+        "| **C-CHAIN PPO** | **mean** | **-15.0** | **-40.0** | **-27.5** |",
     ]
 
 

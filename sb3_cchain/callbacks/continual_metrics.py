@@ -25,7 +25,8 @@ class ContinualMetrics(BaseCallback):
       paper)
 
     Returns are the environment's own, whatever scales or normalises the rewards that the agent learns from.
-    Rollouts in which no episode ends count nowhere. An episode that is cut by a switch counts with its return up to there.
+    Rollouts in which no episode ends count nowhere; off-policy algorithms, whose rollouts are the few steps between two
+    updates, so have a row per episode. An episode that is cut by a switch counts with its return up to there.
 
     The same goes to a CSV file, a line per rollout and task: environment steps at the end of the rollout, task, number of
     episodes that ended, their mean return. They are kept with the model, as ``model.continual_returns``, too, so that training
@@ -56,6 +57,7 @@ class ContinualMetrics(BaseCallback):
         self.rows = [row for row in past if row["timesteps"] <= self.num_timesteps]
         self.model.continual_returns = self.rows  # type: ignore[attr-defined]
         self._averages: dict[int, float] = task_averages(self.rows)
+        self._average_performance = float(np.mean(list(self._averages.values()))) if self._averages else np.nan
         self._n_rows = Counter(int(row["task_id"]) for row in self.rows)
         if self._open_path is not None:
             self._open_path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,9 +97,11 @@ class ContinualMetrics(BaseCallback):
             self._averages[task_id] = average + (row["mean_return"] - average) / self._n_rows[task_id]
             self.logger.record(f"continual/average_task_{task_id}", self._averages[task_id])
             if task_id == self._task_id:
-                self.logger.record("continual/mean_return", row["mean_return"])
+                self.logger.record_mean("continual/mean_return", row["mean_return"])
+        if new:
+            self._average_performance = float(np.mean(list(self._averages.values())))
         if self._averages:
-            self.logger.record("continual/average_performance", np.mean(list(self._averages.values())))
+            self.logger.record("continual/average_performance", self._average_performance)
 
 
 def task_averages(rows: Sequence[Mapping[str, float]]) -> dict[int, float]:

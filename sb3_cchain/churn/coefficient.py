@@ -46,7 +46,8 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
     (Appendix A.1 of the C-CHAIN paper; warm-up, window and minimum as in the released code).
 
     An iteration is whatever is between two calls of ``update``: one ``train()`` of PPO, one gradient step of DQN.
-    The history is kept in buffers, in double precision, and so is saved and restored with ``state_dict``.
+    The history is kept in buffers, in double precision, and so is saved and restored with ``state_dict``. An update costs
+    the same whatever the window.
 
     :param target_ratio: β, the size of λ·L_churn relative to L
     :param initial: λ during the warm-up
@@ -57,6 +58,7 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
 
     base_losses: th.Tensor
     churn_losses: th.Tensor
+    sums: th.Tensor
     n_seen: th.Tensor
 
     def __init__(self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0):
@@ -70,6 +72,8 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         self.minimum = float(minimum)
         self.register_buffer("base_losses", th.zeros(window, dtype=th.float64))
         self.register_buffer("churn_losses", th.zeros(window, dtype=th.float64))
+        # Of the base and the churn losses in the window
+        self.register_buffer("sums", th.zeros(2, dtype=th.float64))
         self.register_buffer("n_seen", th.zeros((), dtype=th.int64))
 
     @property
@@ -80,8 +84,8 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
             return self.initial
         n_kept = min(n_seen, len(self.base_losses))
         # 1e-8 as in the released code: a network that does not churn at all has no ratio
-        ratio = self.base_losses[:n_kept].sum() / (self.churn_losses[:n_kept].sum() + n_kept * 1e-8)
-        return max(self.target_ratio * float(ratio), self.minimum)
+        base_sum, churn_sum = self.sums.tolist()
+        return max(self.target_ratio * base_sum / (churn_sum + n_kept * 1e-8), self.minimum)
 
     @property
     def is_zero(self) -> bool:
@@ -95,14 +99,21 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         :param base_loss: The loss that the churn loss is added to; its absolute value counts
         :param churn_loss: The churn loss, not multiplied by λ; its absolute value counts
         """
-        slot = int(self.n_seen) % len(self.base_losses)
-        self.base_losses[slot] = abs(base_loss)
-        self.churn_losses[slot] = abs(churn_loss)
-        self.n_seen += 1
+        n_seen = int(self.n_seen)
+        for index, (losses, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
+            # Views of the buffers' memory: an element is written in a fraction of the time that it takes a tensor
+            history, sums = losses.numpy(), self.sums.numpy()
+            slot = n_seen % len(history)
+            sums[index] += abs(loss) - history[slot]
+            history[slot] = abs(loss)
+            if slot == len(history) - 1:
+                sums[index] = history.sum()  # anew once per window, so that rounding errors do not add up
+        self.n_seen.fill_(n_seen + 1)
 
     def reset(self) -> None:
         """Forget the losses seen and begin a new warm-up."""
-        self.n_seen.zero_()
+        for buffer in self.buffers():
+            buffer.zero_()
 
 
 def make_coefficient(

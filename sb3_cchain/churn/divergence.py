@@ -7,6 +7,7 @@ Each returns a scalar, the mean over the batch. ``old`` is a constant: no gradie
 from collections.abc import Callable
 
 import torch as th
+from torch.nn import functional as F
 
 Divergence = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
@@ -37,4 +38,4 @@ def mean_squared_difference(old: th.Tensor, new: th.Tensor) -> th.Tensor:
     :param new: Outputs after the update, of the same shape
     :return: Mean over all elements
     """
-    return (new - old).pow(2).mean()
+    return F.mse_loss(new, old)

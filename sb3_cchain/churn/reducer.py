@@ -53,9 +53,9 @@ class ChurnReducer(nn.Module):
         self.warned_of_overlap = False
         self.reference: Observations | None = None
         self.old_outputs: th.Tensor | None = None
-        # Since the last `end_iteration()`, one for each update
+        # Since the last `end_iteration()`, one for each update: the churn loss, and the outputs before and after
         self.losses: list[float] = []
-        self._compared: list[th.Tensor] = []
+        self.compared: list[tuple[th.Tensor, th.Tensor]] = []
 
     def backward(self, reference: Observations) -> None:
         """
@@ -83,7 +83,7 @@ class ChurnReducer(nn.Module):
                 self._coef = self.coefficient.value
             (self._coef * churn_loss).backward()
             self.losses.append(loss)
-            self._compared.append(self.old_outputs)
+            self.compared.append((self.old_outputs, new_outputs.detach()))
         self.reference, self.old_outputs = reference, next_old_outputs
 
     def mean_churn(self) -> float:
@@ -93,10 +93,10 @@ class ChurnReducer(nn.Module):
         """
         if not self.losses:
             return float("nan")
-        sizes = [len(outputs) for outputs in self._compared]
+        sizes = [len(old) for old, _ in self.compared]
         mean_loss = sum(loss * size for loss, size in zip(self.losses, sizes, strict=True)) / sum(sizes)
-        compared = th.cat(self._compared)
-        return mean_loss - self.divergence(compared, compared).item()
+        unmoved = th.cat([old for old, _ in self.compared])
+        return mean_loss - self.divergence(unmoved, unmoved).item()
 
     def end_iteration(self, base_loss: float) -> None:
         """
@@ -106,7 +106,7 @@ class ChurnReducer(nn.Module):
         """
         if self.losses:
             self.coefficient.update(base_loss, sum(self.losses) / len(self.losses))
-        self.losses, self._compared = [], []
+        self.losses, self.compared = [], []
 
     def forget_reference(self) -> None:
         """Drop the reference batch: the next update has no churn loss (after the network was replaced, say)."""

@@ -20,6 +20,7 @@ from sb3_cchain.common.policy_outputs import (
     policy_outputs,
     policy_values,
 )
+from sb3_cchain.common.replaced import replaced
 
 
 def make_policy_reducer(model: OnPolicyAlgorithm, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
@@ -72,19 +73,6 @@ class ReferenceBatches:
 
 
 @contextmanager
-def _replaced(owner: object, name: str, method: Callable) -> Iterator[None]:
-    before = vars(owner).get(name)
-    setattr(owner, name, method)
-    try:
-        yield
-    finally:
-        if before is None:
-            delattr(owner, name)
-        else:
-            setattr(owner, name, before)
-
-
-@contextmanager
 def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
     """
     Run ``model``'s own ``train()`` in this block to train it with churn reduction.
@@ -120,7 +108,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
             reducer.backward(references.current)
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
-    with _replaced(rollout_buffer, "get", references.get), extra_gradient(policy.optimizer, backward):
+    with replaced(rollout_buffer, "get", references.get), extra_gradient(policy.optimizer, backward):
         yield
 
     if references.overlapping and not reducer.warned_of_overlap:

@@ -14,6 +14,7 @@ CONTINUAL_ENVS: dict[str, dict] = {
         # σ = 2 is too large for it to be learnable (Appendix A.1 of the paper)
         "kwargs": {"env_id": "MountainCar-v0", "n_tasks": 5, "steps_per_task": 320_000, "offset_std": 0.02},
     },
+    "MinAtar-v0": {"entry_point": "sb3_cchain.envs.minatar:ContinualMinAtar"},
 }
 
 

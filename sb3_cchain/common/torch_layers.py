@@ -1,0 +1,39 @@
+"""Feature extractors."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+
+class MinAtarCNN(BaseFeaturesExtractor):
+    """
+    The network of the MinAtar paper (https://arxiv.org/abs/1903.03176): a convolution of 16 filters, 3×3, stride 1, and a
+    linear layer of 128 units, each followed by ReLU.
+
+    Give it as ``features_extractor_class`` to any policy, with ``net_arch=[]`` (PPO: ``net_arch=dict(pi=[], vf=[])``) to have
+    nothing between the features and the outputs.
+
+    :param observation_space: ``Box`` of shape (height, width, channels), of any dtype
+    :param features_dim: Number of features
+    :raises ValueError: For another observation space, or one smaller than 3×3
+    """
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 128):
+        super().__init__(observation_space, features_dim)
+        shape = observation_space.shape
+        if not isinstance(observation_space, spaces.Box) or len(shape) != 3 or min(shape[:2]) < 3:
+            raise ValueError(
+                "MinAtarCNN needs Box observations of shape (height, width, channels), at least 3 high and wide; got "
+                f"{observation_space}"
+            )
+        height, width, n_channels = shape
+        self.cnn = nn.Sequential(nn.Conv2d(n_channels, 16, kernel_size=3), nn.ReLU(), nn.Flatten())
+        self.linear = nn.Sequential(nn.Linear(16 * (height - 2) * (width - 2), features_dim), nn.ReLU())
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: ``(batch_size, height, width, channels)``
+        :return: Features ``(batch_size, features_dim)``
+        """
+        return self.linear(self.cnn(observations.permute(0, 3, 1, 2)))
