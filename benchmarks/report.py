@@ -39,7 +39,7 @@ def row_of(run: Run, returns: Returns = Run.returns) -> list[str]:
     :return: Cells: algorithm, seed, average return of each task, mean over the tasks
     """
     averages = averages_of(run, returns)
-    return [LABELS[run.algo], str(run.seed), *(_figure(average) for average in [*averages, np.mean(averages)])]
+    return [LABELS[run.algo], str(run.seed), *(_figure(average) for average in [*averages, float(np.mean(averages))])]
 
 
 def _figure(average: float) -> str:
@@ -84,8 +84,8 @@ def plot_curves(
     task_names: Sequence[str] | None = None,
 ) -> None:
     """
-    Draw the return of each rollout (or evaluation) against environment steps, a thin line per run, a thick one for the mean over seeds,
-    and the task switches.
+    Draw the return of each rollout (or evaluation) against environment steps, a thin line per run, a thick one for the mean
+    over seeds, and the task switches.
 
     :param runs: Finished runs of one environment and length
     :param path: PNG file

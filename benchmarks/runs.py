@@ -116,7 +116,11 @@ class Run:
         logged = np.load(files[0])
         return [
             # The step that ends a task is still of that task
-            {"timesteps": int(steps), "task_id": (int(steps) - 1) // self.steps_per_task, "mean_return": float(np.mean(returns))}
+            {
+                "timesteps": int(steps),
+                "task_id": (int(steps) - 1) // self.steps_per_task,
+                "mean_return": float(np.mean(returns)),
+            }
             for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
         ]
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 try:
     import optuna
@@ -27,7 +28,7 @@ except ImportError as error:
 
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 
-OUR_ALGOS = {"ppo_cchain": CChainPPO, "dqn_cchain": CChainDQN, "double_dqn": DoubleDQN}
+OUR_ALGOS: dict[str, type[BaseAlgorithm]] = {"ppo_cchain": CChainPPO, "dqn_cchain": CChainDQN, "double_dqn": DoubleDQN}
 
 
 def sample_ppo_cchain_params(

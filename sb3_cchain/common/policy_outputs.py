@@ -125,7 +125,7 @@ def has_training_mode(policy: nn.Module) -> bool:
 
 
 @contextmanager
-def as_it_acts(policy: ActorCriticPolicy) -> Iterator[None]:
+def as_it_acts(policy: BasePolicy) -> Iterator[None]:
     """
     Evaluation mode, inside ``train()``: running BatchNorm statistics and no dropout, whose noise is no churn.
 

@@ -19,7 +19,7 @@ SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
 # SB3's own training step for another loss: the same code, for which the name `F` stands for something else.
 # Whatever a release of SB3 changes there is changed here too; a loss that it takes from elsewhere raises an AttributeError.
-_TRAIN = {
+_TRAIN: dict[str, Callable[..., None]] = {
     "huber": DQN.train,
     "mse": FunctionType(
         DQN.train.__code__,

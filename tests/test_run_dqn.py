@@ -1,0 +1,307 @@
+"""CChainDQN runs wherever DQN does, and says what it does."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN, PPO, HerReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from torch import nn
+
+from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
+from sb3_cchain.common.torch_layers import MinAtarCNN
+from tests.envs import CountEnv, RandomEnv
+
+SETTINGS = dict(learning_starts=20, buffer_size=200, batch_size=8, train_freq=1, learning_rate=1e-3, seed=0, device="cpu")
+CHURN_KEYS = {"churn/loss", "churn/coef", "churn/relative_loss", "churn/value_churn", "churn/greedy_action_changes"}
+
+BOX = spaces.Box(-1, 1, (4,), np.float32)
+IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+CELLS = spaces.Box(0, 1, (10, 10, 4), np.bool_)
+
+
+def learn(env=None, policy="MlpPolicy", n_timesteps=50, **kwargs):
+    # Without logs in between, so that the last updates' are there to look at
+    return CChainDQN(policy, env or RandomEnv(), **{**SETTINGS, **kwargs}).learn(n_timesteps, log_interval=10**6)
+
+
+def assert_churn_was_reduced(model):
+    logged = model.logger.name_to_value
+    assert CHURN_KEYS <= set(logged)
+    assert all(np.isfinite(logged[key]) for key in CHURN_KEYS)
+    assert logged["churn/value_churn"] > 0
+
+
+@pytest.mark.parametrize(
+    "policy, observation_space",
+    [
+        ("MlpPolicy", BOX),
+        ("MlpPolicy", spaces.Discrete(5)),
+        ("MlpPolicy", spaces.MultiBinary(4)),
+        ("CnnPolicy", IMAGE),
+        ("MultiInputPolicy", spaces.Dict({"vector": BOX, "image": IMAGE})),
+    ],
+    ids=["Box", "Discrete", "MultiBinary", "image", "Dict"],
+)
+def test_spaces(policy, observation_space):
+    assert_churn_was_reduced(learn(RandomEnv(observation_space), policy))
+
+
+@pytest.mark.parametrize("vec_env_cls", [None, SubprocVecEnv])
+def test_vectorised_and_normalised(vec_env_cls):
+    env = VecNormalize(make_vec_env(RandomEnv, n_envs=2, vec_env_cls=vec_env_cls))
+    references = []
+    model = CChainDQN("MlpPolicy", env, **SETTINGS)
+    backward = model.churn_reducer.backward
+    model.churn_reducer.backward = lambda reference: (references.append(reference), backward(reference))
+    model.learn(100, log_interval=10**6)
+    assert_churn_was_reduced(model)
+    # Reference batches are normalised as minibatches are: the buffer holds the environment's own observations, in [-1, 1]
+    assert th.cat(references).abs().max() > 1 >= np.abs(model.replay_buffer.observations).max()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "arguments, n_updates",
+    [
+        (dict(gradient_steps=3), 90),
+        (dict(train_freq=5, gradient_steps=-1), 30),
+        (dict(train_freq=(1, "episode"), gradient_steps=2), 6),
+        (dict(n_steps=3), 30),
+        (dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)), 30),
+        (dict(learning_rate=lambda progress: 1e-3 * (1 + progress), tau=0.5, max_grad_norm=float("inf")), 30),
+    ],
+    ids=str,
+)
+def test_other_arguments_of_dqn(arguments, n_updates):
+    model = learn(**arguments)
+    assert model._n_updates == n_updates
+    assert_churn_was_reduced(model)
+    assert isinstance(model.replay_buffer, NStepReplayBuffer) == ("n_steps" in arguments)
+    assert "zero_grad" not in vars(model.policy.optimizer) and model.q_net_target is model.policy.q_net_target
+
+
+def test_hindsight_experience_replay():
+    model = learn(BitFlippingEnv(n_bits=4), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+    assert_churn_was_reduced(model)
+
+
+class NormalisedExtractor(BaseFeaturesExtractor):
+    """BatchNorm and dropout."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 8)
+        self.net = nn.Sequential(nn.Linear(4, 8), nn.BatchNorm1d(8), nn.Dropout(0.5))
+
+    def forward(self, observations):
+        return self.net(observations)
+
+
+def test_batch_norm_and_dropout_act_in_the_churn_loss_as_they_do_in_the_environment():
+    model = learn(policy_kwargs=dict(features_extractor_class=NormalisedExtractor))
+    assert_churn_was_reduced(model)
+    reducer, extractor = model.churn_reducer, model.q_net.features_extractor
+    running_mean = extractor.net[1].running_mean.clone()
+    model.q_net.eval()
+    with th.no_grad():
+        outputs = model.q_net(th.ones(8, 4))
+    model.q_net.train()
+    backward, seen = reducer.backward, []
+    reducer.backward = lambda reference: (backward(th.ones(8, 4)), seen.append((model.q_net.training, reducer.old_outputs)))
+    model.replay_buffer.observations[:] = model.replay_buffer.next_observations[:] = 0
+    model.train(gradient_steps=1, batch_size=8)
+    # The reference batch of ones was seen in evaluation mode; only the minibatch of zeros moved the statistics
+    assert [training for training, _ in seen] == [False]
+    assert model.q_net.training
+    moved = extractor.net[1].running_mean
+    bias = extractor.net[0].bias
+    assert not th.equal(moved, running_mean) and outputs.shape == seen[0][1].shape == (8, 3)
+    assert (moved - bias).norm() < (running_mean - bias).norm()
+
+
+def test_positional_arguments_are_those_of_dqn():
+    model = CChainDQN("MlpPolicy", RandomEnv(), 1e-3, 100, 7, 16, device="cpu")
+    assert (model.learning_rate, model.buffer_size, model.learning_starts, model.batch_size) == (1e-3, 100, 7, 16)
+    assert model.double_q and model.loss == "huber"
+    coefficient = model.churn_reducer.coefficient
+    assert (coefficient.target_ratio, coefficient.initial, coefficient.warmup) == (0.01, 50, 10_000)
+    assert len(coefficient.base_losses) == 50_000
+
+
+def test_what_is_logged():
+    """Two updates in a call, so that the second has churn: computed from the networks before and after the first."""
+    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=2.0, **{**SETTINGS, "learning_rate": 0.1}).learn(20)
+    reducer, pairs = model.churn_reducer, []
+
+    def backward(reference, backward=reducer.backward):
+        if reducer.reference is not None:
+            with th.no_grad():
+                pairs.append((reducer.old_outputs, model.q_net(reducer.reference)))
+        backward(reference)
+
+    reducer.backward = backward
+    model.logger.name_to_value.clear()
+    model.train(gradient_steps=2, batch_size=8)
+    ((old, new),) = pairs
+    logged = model.logger.name_to_value
+    assert logged["churn/loss"] == pytest.approx(((old - new) ** 2).mean().item())
+    assert logged["churn/coef"] == 2.0
+    assert logged["churn/relative_loss"] == pytest.approx(2 * logged["churn/loss"] / logged["train/loss"], rel=1e-4)
+    assert logged["churn/value_churn"] == pytest.approx((old - new).abs().mean().item())
+    changes = [int(a.argmax() != b.argmax()) for a, b in zip(old, new, strict=True)]
+    assert 0 < sum(changes) < 8
+    assert logged["churn/greedy_action_changes"] == pytest.approx(np.mean(changes))
+
+
+def test_logs_are_means_over_the_updates_between_two_logs():
+    model = learn(n_timesteps=23, churn_warmup=1, churn_window=100, target_churn_ratio=0.5)
+    history = model.churn_reducer.coefficient.churn_losses[:2]
+    assert model.logger.name_to_value["churn/loss"] == pytest.approx(history.mean().item())
+
+
+def test_adaptive_coefficient_holds_the_ratio():
+    model = learn(churn_warmup=1, churn_window=1, target_churn_ratio=0.3)
+    coefficient = model.churn_reducer.coefficient
+    expected = 0.3 * coefficient.base_losses.item() / (coefficient.churn_losses.item() + 1e-8)
+    assert coefficient.value == pytest.approx(expected)
+    assert coefficient.base_losses.item() == pytest.approx(model.logger.name_to_value["train/loss"])
+
+
+def test_tensorboard_names(tmp_path):
+    for cls in (CChainDQN, DoubleDQN):
+        cls("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **SETTINGS).learn(25)
+    assert {folder.name for folder in tmp_path.iterdir()} == {"CChainDQN_1", "DoubleDQN_1"}
+
+
+def test_another_policy_put_in_place():
+    model, other = learn(), learn(seed=1)
+    model.policy = other.policy
+    model._create_aliases()
+    model.learn(50, log_interval=10**6)
+    assert_churn_was_reduced(model)
+
+
+def test_not_a_number_raises_and_leaves_the_parameters_finite():
+    model = learn()
+    model.churn_reducer.old_outputs.fill_(float("nan"))
+    with pytest.raises(ValueError, match="The churn loss is nan"):
+        model.learn(50)
+    assert all(p.isfinite().all() for p in model.policy.parameters())
+    assert "zero_grad" not in vars(model.policy.optimizer) and model.q_net_target is model.policy.q_net_target
+
+
+def test_continual_environment_brings_its_callbacks():
+    env = ContinualEnv([CountEnv, CountEnv], 60)
+    model = learn(env, n_timesteps=120, reset_churn_coef=True)
+    assert [row["task_id"] for row in model.continual_returns] == [0] * 9 + [1] * 8
+    assert [row["mean_return"] for row in model.continual_returns] == [7.0] * 8 + [4.0] + [7.0] * 8
+    # λ started over at the switch: the updates of the second task
+    assert model.churn_reducer.coefficient.n_seen == 60
+
+
+# --- Bad input ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+@pytest.mark.parametrize(
+    "action_space", [spaces.Box(-1, 1, (2,), np.float32), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], ids=str
+)
+def test_other_actions_are_refused(cls, action_space):
+    message = f"{cls.__name__} needs an environment with Discrete actions, got {type(action_space).__name__}"
+    with pytest.raises(TypeError, match=message):
+        cls("MlpPolicy", RandomEnv(action_space=action_space))
+    with pytest.raises(TypeError, match="Discrete actions, got Box"):
+        cls("MlpPolicy", "Pendulum-v1")
+
+
+@pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        ({"loss": "mae"}, ValueError, """`loss` must be "huber" or "mse", got 'mae'"""),
+        ({"loss": None}, ValueError, """`loss` must be "huber" or "mse", got None"""),
+        ({"double_q": "yes"}, TypeError, "`double_q` must be True or False, got 'yes'"),
+    ],
+)
+def test_bad_arguments(cls, arguments, error, message):
+    with pytest.raises(error, match=message):
+        cls("MlpPolicy", "no environment is made", **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments, name",
+    [
+        ({"churn_coef": -0.5}, "churn_coef"),
+        ({"target_churn_ratio": "big"}, "target_churn_ratio"),
+        ({"churn_window": 0}, "churn_window"),
+    ],
+)
+def test_bad_churn_arguments(arguments, name):
+    with pytest.raises(ValueError, match=f"`{name}`.*got {next(iter(arguments.values()))!r}"):
+        CChainDQN("MlpPolicy", "no environment is made", **arguments)
+
+
+def test_n_step_returns_of_dict_observations_are_refused():
+    env = RandomEnv(spaces.Dict({"a": BOX}))
+    with pytest.raises(ValueError, match="`n_steps=1`, got 3"):
+        DoubleDQN("MultiInputPolicy", env, n_steps=3)
+
+
+# --- The feature extractor ------------------------------------------------------------------------------------------------
+
+
+def test_minatar_network_by_hand():
+    extractor = MinAtarCNN(CELLS)
+    # 16 filters of 3×3×4 and a bias; 8×8 places of 16 features to 128 units and a bias
+    assert sum(p.numel() for p in extractor.parameters()) == 16 * (3 * 3 * 4 + 1) + 128 * (8 * 8 * 16 + 1)
+    observation = th.zeros(1, 10, 10, 4)
+    observation[0, 2, 7, 3] = 1
+    with th.no_grad():
+        conv = extractor.cnn[0]
+        expected = conv.bias[5] + conv.weight[5, 3, 2, 1]  # the cell seen by the filter whose corner is at (0, 6)
+        features = extractor.cnn(observation.permute(0, 3, 1, 2)).reshape(16, 8, 8)
+        assert th.allclose(features[5, 0, 6], expected.relu())
+        assert th.allclose(features[5, 5, 0], conv.bias[5].relu())
+        assert th.equal(extractor(observation), extractor.linear(features.reshape(1, -1)))
+        assert extractor(observation).shape == (1, 128) and extractor(observation).min() >= 0
+
+
+@pytest.mark.parametrize(
+    "space",
+    [BOX, spaces.Box(0, 1, (2, 10, 4)), spaces.Box(0, 255, (1, 9, 2), np.uint8), spaces.MultiBinary((10, 10, 4))],
+    ids=str,
+)
+def test_minatar_network_refuses_other_observations(space):
+    with pytest.raises(ValueError, match="MinAtarCNN needs Box observations"):
+        MinAtarCNN(space)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, DQN, CChainDQN])
+@pytest.mark.parametrize("space", [CELLS, spaces.Box(0, 255, (10, 10, 4), np.uint8)], ids=["bool", "uint8"])
+def test_minatar_network_in_policies(algorithm, space):
+    settings = dict(n_steps=16, batch_size=8) if algorithm is PPO else SETTINGS
+    net_arch = dict(pi=[], vf=[]) if algorithm is PPO else []
+    policy_kwargs = dict(features_extractor_class=MinAtarCNN, net_arch=net_arch)
+    model = algorithm("MlpPolicy", RandomEnv(space), **{**settings, "device": "cpu", "policy_kwargs": policy_kwargs})
+    model.learn(32)
+    extractor = model.policy.features_extractor if algorithm is PPO else model.q_net.features_extractor
+    assert extractor.cnn[0].weight.shape == (16, 4, 3, 3)
+    assert extractor.linear[0].in_features == 16 * 8 * 8
+
+
+def test_observations_stay_small_in_the_replay_buffer():
+    env = RandomEnv(spaces.Box(0, 1, (10, 10, 10), np.bool_))
+    buffer = learn(env, policy_kwargs=dict(features_extractor_class=MinAtarCNN, net_arch=[])).replay_buffer
+    assert buffer.observations.dtype == buffer.next_observations.dtype == np.bool_
+    arrays = [array for array in vars(buffer).values() if isinstance(array, np.ndarray)]
+    bytes_per_transition = sum(array.nbytes for array in arrays) / buffer.buffer_size
+    assert 2000 <= bytes_per_transition and 500_000 * bytes_per_transition <= 1.2e9
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_cuda():
+    assert_churn_was_reduced(learn(device="cuda"))
