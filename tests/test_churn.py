@@ -1,6 +1,8 @@
 """The torch-only part: divergences, λ, the reducer, the seam."""
 
 import math
+import random
+import statistics
 
 import pytest
 import torch as th
@@ -78,6 +80,23 @@ def test_adaptive_coefficient_state_is_restored():
     for c in (coef, restored):
         c.update(3.0, 0.1)
     assert restored.value == coef.value
+
+
+@pytest.mark.parametrize("window", [1, 2, 7])
+def test_running_means_of_losses_of_any_size(window):
+    """Against means over lists; losses of 1e-12 to 1e12, whose rounding errors a careless running sum would keep."""
+    coef = AdaptiveChurnCoefficient(target_ratio=2.0, warmup=0, window=window)
+    generator = random.Random(0)
+    base, churn = [], []
+    for _ in range(500):
+        base.append(10 ** generator.uniform(-12, 12))
+        churn.append(10 ** generator.uniform(-12, 12))
+        coef.update(-base[-1], churn[-1])
+        expected = 2.0 * statistics.fmean(base[-window:]) / (statistics.fmean(churn[-window:]) + 1e-8)
+        assert coef.value == pytest.approx(expected, rel=1e-9)
+    coef.reset()
+    coef.update(3.0, 1.0)
+    assert coef.value == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize(

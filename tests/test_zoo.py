@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 
 import sb3_cchain.zoo as zoo
-from sb3_cchain import CChainPPO
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
@@ -162,6 +162,55 @@ def test_stock_rl_zoo_through_a_callback(tmp_path, trained):
     assert len(read_returns(next((tmp_path / "tb").glob("*/PPO_1/returns.csv")))) == 4
 
 
+# Three games of 100 steps, the random ones at the beginning of each cut to 20
+MINATAR = [
+    *("--env", "Continual/MinAtar-v0", "-n", "300", "--env-kwargs", "steps_per_task:100", "--eval-freq", "100"),
+    *("--eval-episodes", "2", "--num-threads", "1", "--device", "cpu", "--seed", "1", "-f", "logs", "-tb", "tb", "-params"),
+    "callback:['sb3_cchain.TaskSync', 'sb3_cchain.ContinualMetrics', "
+    "{'sb3_cchain.callbacks.TaskLearningStarts': {'learning_starts': 20}}]",
+    *("buffer_size:1000", "churn_warmup:10"),
+]
+
+
+def test_train_on_minatar_by_dqn_cchain(tmp_path):
+    run("sb3_cchain.zoo", "train", "--algo", "dqn_cchain", *MINATAR, "--save-replay-buffer", cwd=tmp_path)
+    folder = tmp_path / "logs" / "dqn_cchain" / "Continual-MinAtar-v0_1"
+    model = CChainDQN.load(folder / "Continual-MinAtar-v0.zip", device="cpu")
+    assert (model.loss, model.double_q, model.learning_rate(1), model.max_grad_norm) == ("mse", True, 3e-4, np.inf)
+    assert sum(p.numel() for p in model.q_net.parameters()) == 16 * (3 * 3 * 10 + 1) + 128 * (8 * 8 * 16 + 1) + 6 * 129
+    assert model._n_updates == 79 + 79 + 80
+    assert model.churn_reducer.coefficient.n_seen == model._n_updates - 1
+    assert model.churn_reducer.coefficient.value != 50
+    assert (folder / "replay_buffer.pkl").exists()
+    (path,) = (tmp_path / "tb").glob("*/CChainDQN_1/returns.csv")
+    assert {row["task_id"] for row in read_returns(path)} == {0, 1, 2}
+    assert list(np.load(folder / "evaluations.npz")["timesteps"]) == [100, 200, 300]
+    arguments = ("enjoy", "--algo", "dqn_cchain", "--env", "Continual/MinAtar-v0", "-f", "logs", "-n", "600", "--no-render")
+    assert re.search(r"^Mean reward: \d", run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path), flags=re.MULTILINE)
+
+
+def test_optimize_dqn_cchain(tmp_path):
+    run(
+        *("sb3_cchain.zoo", "train", "--algo", "dqn_cchain", *MINATAR, "-optimize", "--n-trials", "2"),
+        *("--n-evaluations", "1", "--no-optim-plots"),
+        cwd=tmp_path,
+    )
+    (report,) = tmp_path.glob("logs/dqn_cchain/report_*.csv")
+    header, *trials = report.read_text().splitlines()
+    columns = header.split(",")
+    assert "params_net_arch" not in columns
+    ratios = [float(trial.split(",")[columns.index("params_target_churn_ratio")]) for trial in trials]
+    assert len(set(ratios)) == 2 and all(1e-3 <= ratio <= 1e-1 for ratio in ratios)
+
+
+def test_stock_rl_zoo_trains_dqn_on_minatar(tmp_path):
+    settings = str(ROOT / "zoo_hyperparams" / "dqn.yml")
+    arguments = [argument for argument in MINATAR if argument != "churn_warmup:10"]
+    run("rl_zoo3.train", "--algo", "dqn", "--gym-packages", "sb3_cchain", "-conf", settings, *arguments, cwd=tmp_path)
+    model = DQN.load(tmp_path / "logs/dqn/Continual-MinAtar-v0_1/Continual-MinAtar-v0.zip", device="cpu")
+    assert model._n_updates == 79 + 79 + 80
+
+
 @pytest.mark.parametrize("arguments", [[], ["fly"]])
 def test_usage(monkeypatch, arguments):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
@@ -178,10 +227,35 @@ def test_unknown_environment_names_the_nearest(monkeypatch):
 # --- The YAML files -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algo", ["ppo", "ppo_cchain"])
-def test_every_environment_has_settings(algo):
-    settings = yaml.safe_load(zoo.hyperparams_file(algo, "Continual/Acrobot-v1").read_text())
-    assert {f"Continual/{name}" for name in CONTINUAL_ENVS} | {"default"} <= set(settings)
+def settings_of(algo):
+    return yaml.safe_load((zoo.hyperparams_folder() / f"{algo}.yml").read_text())
+
+
+def test_every_environment_has_settings():
+    continual = {f"Continual/{name}" for name in CONTINUAL_ENVS}
+    for algos, env_ids in (
+        (("ppo", "ppo_cchain"), continual - {"Continual/MinAtar-v0"}),
+        (("dqn", "double_dqn", "dqn_cchain"), {"Continual/MinAtar-v0"}),
+    ):
+        for algo in algos:
+            assert set(settings_of(algo)) - {"default", "gym-control-defaults"} == env_ids
+    for algo in zoo.OUR_ALGOS:
+        assert "default" in settings_of(algo)
+
+
+def test_dqn_settings_differ_where_the_algorithms_do():
+    dqn, double, cchain = (settings_of(algo)["Continual/MinAtar-v0"] for algo in ("dqn", "double_dqn", "dqn_cchain"))
+    assert double == {**dqn, "double_q": True, "loss": "mse"}
+    churn = {key: value for key, value in cchain.items() if "churn" in key}
+    assert cchain == {**double, **churn}
+    assert (churn["churn_coef"], churn["target_churn_ratio"]) == ("auto_50", 0.01)
+    assert (churn["churn_warmup"], churn["churn_window"], churn["reset_churn_coef"]) == (10_000, 50_000, False)
+
+
+@pytest.mark.parametrize("algo, cls", [("double_dqn", DoubleDQN), ("dqn_cchain", CChainDQN), ("ppo_cchain", CChainPPO)])
+def test_our_algorithms_are_known(algo, cls):
+    assert zoo.OUR_ALGOS[algo] is cls
+    assert zoo.hyperparams_file(algo, "CartPole-v1").name == f"{algo}.yml"
 
 
 def test_c_chain_and_vanilla_differ_in_the_churn_arguments_alone():

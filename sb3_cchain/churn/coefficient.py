@@ -104,10 +104,11 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
             # Views of the buffers' memory: an element is written in a fraction of the time that it takes a tensor
             history, sums = losses.numpy(), self.sums.numpy()
             slot = n_seen % len(history)
-            sums[index] += abs(loss) - history[slot]
-            history[slot] = abs(loss)
-            if slot == len(history) - 1:
-                sums[index] = history.sum()  # anew once per window, so that rounding errors do not add up
+            forgotten, history[slot] = history[slot], abs(loss)
+            sums[index] += abs(loss) - forgotten
+            # Anew once per window, and when most of it leaves: else rounding errors would add up, or outlive their cause
+            if slot == len(history) - 1 or forgotten > sums[index]:
+                sums[index] = history.sum()
         self.n_seen.fill_(n_seen + 1)
 
     def reset(self) -> None:
