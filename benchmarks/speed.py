@@ -1,13 +1,15 @@
 """
-What churn reduction costs: PPO, CChainPPO, and the loop that copies the network at every minibatch, timed in turn in one
-process under the Gym Control settings. Prints ratios; the machine's own speed drops out.
+What churn reduction costs: the base algorithm, C-CHAIN, and the loop that copies the network at every minibatch, timed in turn
+in one process under the shipped settings. Prints ratios; the machine's own speed drops out.
 
     python -m benchmarks.speed
+    python -m benchmarks.speed --case minatar
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,28 +19,91 @@ import yaml
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import PPO
 from torch import nn
 
+from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
-from sb3_cchain import CChainPPO
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.zoo import hyperparams_folder
 
-ENV_ID = "Continual/Acrobot-v1"
-PPO_ARGUMENTS = (
-    *("policy", "n_steps", "batch_size", "n_epochs", "learning_rate", "gamma", "gae_lambda", "clip_range"),
-    *("ent_coef", "vf_coef", "max_grad_norm", "normalize_advantage", "policy_kwargs"),
-)
+# What RL Zoo takes out of the hyperparameters before it makes the model
+NOT_THE_MODELS = {"callback", "env_wrapper", "monitor_kwargs", "n_timesteps"}
 
 
-def gym_control_settings() -> dict[str, Any]:
+@dataclass
+class Case:
     """
-    :return: PPO's arguments in the shipped hyperparameters
+    Three models under the same settings, the last of which copies its network, and what is timed of each.
+
+    :param title: What it stands for
+    :param models: By name: base, C-CHAIN, deep copy
+    :param measures: By name, calls on a model
     """
-    settings = yaml.safe_load((hyperparams_folder() / "ppo.yml").read_text())[ENV_ID]
-    arguments = {name: settings[name] for name in PPO_ARGUMENTS}
+
+    title: str
+    models: dict[str, Any]
+    measures: dict[str, Callable[[Any], Any]]
+
+
+def settings_of(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
+    """
+    :param algo: Name of a file of hyperparameters
+    :param env_id: Environment id
+    :param changed: What shall differ
+    :return: The model's arguments in the shipped hyperparameters
+    """
+    settings = yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text())[env_id]
+    settings = {name: value for name, value in settings.items() if name not in NOT_THE_MODELS}
     # As RL Zoo reads it
-    return {**arguments, "policy_kwargs": eval(arguments["policy_kwargs"], {"nn": nn})}
+    settings["policy_kwargs"] = eval(settings["policy_kwargs"], {"nn": nn, "get_class_by_name": get_class_by_name})
+    return {**settings, "env": env_id, "seed": 0, "device": "cpu", **changed}
+
+
+def gym_control() -> Case:
+    """
+    :return: PPO under the Gym Control settings: two networks of 3 × 256 units, minibatches of 32
+    """
+    settings = settings_of("ppo", "Continual/Acrobot-v1")
+    models = {"PPO": PPO(**settings), "CChainPPO": CChainPPO(**settings), "deep copy": DeepCopyPPO(**settings)}
+    for model in models.values():
+        model.learn(2 * model.n_steps)  # warm; every later update has a churn loss
+    return Case(
+        "Continual/Acrobot-v1",
+        models,
+        {
+            "train()": lambda model: model.train(),
+            "iteration (rollout and train)": lambda model: model.learn(model.n_steps, reset_num_timesteps=False),
+        },
+    )
+
+
+def minatar(n_past_updates: int = 0) -> Case:
+    """
+    :param n_past_updates: Updates that count as made before, for what the running means go over
+    :return: Double DQN under the MinAtar settings: a small convolutional network, minibatches of 32
+    """
+    settings = settings_of("double_dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=1000)
+    models: dict[str, Any] = {"DoubleDQN": DoubleDQN(**settings), "CChainDQN": CChainDQN(**settings)}
+    models["deep copy"] = DeepCopyDQN(**{name: value for name, value in settings.items() if name not in ("double_q", "loss")})
+    for model in models.values():
+        model.learn(1200)
+    for _ in range(n_past_updates):
+        models["CChainDQN"].churn_reducer.coefficient.update(0.01, 1e-6)
+        models["deep copy"].td_losses.append(0.01)
+        models["deep copy"].churn_losses.append(1e-6)
+    return Case(
+        "Continual/MinAtar-v0" + (f" after {n_past_updates} updates" if n_past_updates else ""),
+        models,
+        {
+            "100 × train()": lambda model: [model.train(gradient_steps=1, batch_size=32) for _ in range(100)],
+            "100 environment steps, an update each": lambda model: model.learn(100, reset_num_timesteps=False),
+        },
+    )
+
+
+CASES = {"gym_control": gym_control, "minatar": minatar, "minatar_later": partial(minatar, n_past_updates=50_000)}
 
 
 def seconds(call: Callable[[], Any]) -> float:
@@ -51,39 +116,34 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
+def ratios(case: Case, n_rounds: int) -> Table:
+    """
+    :param case: What to time
+    :param n_rounds: Timings of each
+    :return: Ratios within a round
+    """
+    base, ours, copying = case.models
+    table = Table("", "ratio", "median", "min", "max", title=f"{case.title}, {n_rounds} rounds, one thread")
+    for measure, call in case.measures.items():
+        rounds = [
+            {name: seconds(partial(call, model)) for name, model in case.models.items()}
+            for _ in track(range(n_rounds), description=measure)
+        ]
+        for one, other in ((ours, base), (ours, copying), (copying, base)):
+            figures = [timing[one] / timing[other] for timing in rounds]
+            table.add_row(measure, f"{one} / {other}", *(f"{f(figures):.2f}" for f in (np.median, np.min, np.max)))
+    return table
+
+
 def main() -> None:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", nargs="+", default=list(CASES), choices=list(CASES), help="What to time")
     parser.add_argument("--rounds", type=int, default=20, help="Timings of each")
     args = parser.parse_args()
     th.set_num_threads(1)
-
-    settings = gym_control_settings()
-    models: dict[str, PPO] = {
-        "PPO": PPO(env=ENV_ID, seed=0, device="cpu", **settings),
-        "CChainPPO": CChainPPO(env=ENV_ID, seed=0, device="cpu", **settings),
-        "deep copy": DeepCopyPPO(env=ENV_ID, seed=0, device="cpu", **settings),
-    }
-    for model in models.values():
-        model.learn(2 * model.n_steps)  # warm; every later update has a churn loss
-
-    measures: dict[str, Callable[[PPO], Any]] = {
-        "train()": lambda model: model.train(),
-        "iteration (rollout and train)": lambda model: model.learn(model.n_steps, reset_num_timesteps=False),
-    }
-    table = Table("", "ratio", "median", "min", "max", title=f"{ENV_ID}, {args.rounds} rounds, one thread")
-    for measure, call in measures.items():
-        rounds = [
-            {name: seconds(partial(call, model)) for name, model in models.items()}
-            for _ in track(range(args.rounds), description=measure)
-        ]
-        for over in ("PPO", "deep copy"):
-            ratios = [timing["CChainPPO"] / timing[over] for timing in rounds]
-            figures = [f"{statistic(ratios):.2f}" for statistic in (np.median, np.min, np.max)]
-            table.add_row(measure, f"CChainPPO / {over}", *figures)
-        ratios = [timing["deep copy"] / timing["PPO"] for timing in rounds]
-        table.add_row(measure, "deep copy / PPO", *(f"{f(ratios):.2f}" for f in (np.median, np.min, np.max)))
-    Console().print(table)
+    for name in args.case:
+        Console().print(ratios(CASES[name](), args.rounds))
 
 
 if __name__ == "__main__":

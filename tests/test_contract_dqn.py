@@ -15,6 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from sb3_cchain import CChainDQN, DoubleDQN
+from sb3_cchain.common import off_policy_churn
 from tests.envs import RandomEnv
 
 SETTINGS = dict(
@@ -99,19 +100,6 @@ def test_double_dqn_equals_sb3_source_with_other_targets_and_loss(double_q, loss
     assert "train" not in vars(ours) and ours.q_net_target is ours.policy.q_net_target
 
 
-@pytest.mark.parametrize("max_grad_norm", [10, 0.05])
-@pytest.mark.parametrize("double_q, loss", [(True, "mse"), (False, "huber")])
-def test_c_chain_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max_grad_norm):
-    arguments = dict(SETTINGS, max_grad_norm=max_grad_norm)
-    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN)
-    written_out = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
-    ours = CChainDQN("MlpPolicy", "CartPole-v1", double_q=double_q, loss=loss, churn_coef=COEF, **arguments).learn(N_STEPS)
-    assert written_out.n_churn_terms == 219  # the first update has no previous one
-    assert_equal(ours, written_out)
-    vanilla = DoubleDQN("MlpPolicy", "CartPole-v1", double_q=double_q, loss=loss, **arguments).learn(N_STEPS)
-    assert differ(ours, vanilla)
-
-
 class DoublePrecision(FlattenExtractor):
     """The churn loss is a difference of nearly equal numbers: in single precision its rounding errors soon show."""
 
@@ -119,16 +107,44 @@ class DoublePrecision(FlattenExtractor):
         return super().forward(observations).double()
 
 
+def learn_in_double_precision(make, n_steps, env_id="CartPole-v1", **arguments):
+    arguments["policy_kwargs"] = dict(net_arch=[16], features_extractor_class=DoublePrecision)
+    model = make("MlpPolicy", env_id, **arguments)
+    model.policy.double()
+    return model.learn(n_steps)
+
+
+@pytest.mark.parametrize("own_pass", [False, True])
+@pytest.mark.parametrize("max_grad_norm", [10, 0.05])
+@pytest.mark.parametrize("double_q, loss", [(True, "mse"), (False, "huber")])
+def test_c_chain_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max_grad_norm, own_pass, monkeypatch):
+    arguments = dict(SETTINGS, max_grad_norm=max_grad_norm)
+    cchain = partial(CChainDQN, double_q=double_q, loss=loss, churn_coef=COEF)
+    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN)
+    if own_pass:
+        monkeypatch.setattr(off_policy_churn, "has_training_mode", lambda policy: True)
+        reference = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
+        ours = cchain("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
+        assert_equal(ours, reference)
+    else:
+        # Batches of twice the size are summed in another order
+        reference = learn_in_double_precision(written_out, N_STEPS, **arguments)
+        ours = learn_in_double_precision(cchain, N_STEPS, **arguments)
+        for name, parameter in ours.policy.state_dict().items():
+            assert th.allclose(parameter, reference.policy.state_dict()[name], rtol=0, atol=1e-9), name
+    assert reference.n_churn_terms == 219  # the first update has no previous one
+    vanilla = DoubleDQN("MlpPolicy", "CartPole-v1", double_q=double_q, loss=loss, **arguments).learn(N_STEPS)
+    assert not all(
+        th.allclose(p.float(), q, atol=1e-3)
+        for p, q in zip(ours.policy.parameters(), vanilla.policy.parameters(), strict=True)
+    )
+
+
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Acrobot-v1"])
 def test_equals_a_loop_that_copies_the_network(env_id):
     arguments = dict(SETTINGS, target_churn_ratio=0.01, churn_warmup=20, churn_window=50, gradient_steps=1)
-    arguments["policy_kwargs"] = dict(net_arch=[16], features_extractor_class=DoublePrecision)
-    models = []
-    for make in (DeepCopyDQN, partial(CChainDQN, loss="mse")):
-        models.append(make("MlpPolicy", env_id, **arguments))
-        models[-1].policy.double()
-        models[-1].learn(500)
-    copying, ours = models
+    copying = learn_in_double_precision(DeepCopyDQN, 500, env_id, **arguments)
+    ours = learn_in_double_precision(partial(CChainDQN, loss="mse"), 500, env_id, **arguments)
     assert ours._n_updates == copying._n_updates == 225
     for name, parameter in ours.policy.named_parameters():
         assert th.allclose(parameter, copying.policy.get_parameter(name), rtol=0, atol=1e-9), name

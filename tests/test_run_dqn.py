@@ -1,5 +1,7 @@
 """CChainDQN runs wherever DQN does, and says what it does."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -56,8 +58,8 @@ def test_vectorised_and_normalised(vec_env_cls):
     env = VecNormalize(make_vec_env(RandomEnv, n_envs=2, vec_env_cls=vec_env_cls))
     references = []
     model = CChainDQN("MlpPolicy", env, **SETTINGS)
-    backward = model.churn_reducer.backward
-    model.churn_reducer.backward = lambda reference: (references.append(reference), backward(reference))
+    remember = model.churn_reducer.remember
+    model.churn_reducer.remember = lambda reference, outputs: (references.append(reference), remember(reference, outputs))
     model.learn(100, log_interval=10**6)
     assert_churn_was_reduced(model)
     # Reference batches are normalised as minibatches are: the buffer holds the environment's own observations, in [-1, 1]
@@ -132,21 +134,23 @@ def test_positional_arguments_are_those_of_dqn():
     assert len(coefficient.base_losses) == 50_000
 
 
-def test_what_is_logged():
+@pytest.mark.parametrize("double_q", [False, True])
+def test_what_is_logged(double_q):
     """Two updates in a call, so that the second has churn: computed from the networks before and after the first."""
-    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=2.0, **{**SETTINGS, "learning_rate": 0.1}).learn(20)
-    reducer, pairs = model.churn_reducer, []
+    settings = {**SETTINGS, "learning_rate": 0.1}
+    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=2.0, double_q=double_q, **settings).learn(20)
+    reducer, seen = model.churn_reducer, []
 
-    def backward(reference, backward=reducer.backward):
-        if reducer.reference is not None:
-            with th.no_grad():
-                pairs.append((reducer.old_outputs, model.q_net(reducer.reference)))
-        backward(reference)
+    def remember(reference, outputs, remember=reducer.remember):
+        seen.append((reference, copy.deepcopy(model.policy.q_net)))
+        remember(reference, outputs)
 
-    reducer.backward = backward
+    reducer.remember = remember
     model.logger.name_to_value.clear()
     model.train(gradient_steps=2, batch_size=8)
-    ((old, new),) = pairs
+    (reference, before), (_, after) = seen
+    with th.no_grad():
+        old, new = before(reference), after(reference)
     logged = model.logger.name_to_value
     assert logged["churn/loss"] == pytest.approx(((old - new) ** 2).mean().item())
     assert logged["churn/coef"] == 2.0
@@ -263,10 +267,10 @@ def test_minatar_network_by_hand():
     with th.no_grad():
         conv = extractor.cnn[0]
         expected = conv.bias[5] + conv.weight[5, 3, 2, 1]  # the cell seen by the filter whose corner is at (0, 6)
-        features = extractor.cnn(observation.permute(0, 3, 1, 2)).reshape(16, 8, 8)
+        features = extractor.cnn(observation.permute(0, 3, 1, 2))[0]
         assert th.allclose(features[5, 0, 6], expected.relu())
         assert th.allclose(features[5, 5, 0], conv.bias[5].relu())
-        assert th.equal(extractor(observation), extractor.linear(features.reshape(1, -1)))
+        assert th.equal(extractor(observation), extractor.linear(features.permute(1, 2, 0).reshape(1, -1)))
         assert extractor(observation).shape == (1, 128) and extractor(observation).min() >= 0
 
 

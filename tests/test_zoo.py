@@ -186,7 +186,9 @@ def test_train_on_minatar_by_dqn_cchain(tmp_path):
     assert {row["task_id"] for row in read_returns(path)} == {0, 1, 2}
     assert list(np.load(folder / "evaluations.npz")["timesteps"]) == [100, 200, 300]
     arguments = ("enjoy", "--algo", "dqn_cchain", "--env", "Continual/MinAtar-v0", "-f", "logs", "-n", "600", "--no-render")
-    assert re.search(r"^Mean reward: \d", run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path), flags=re.MULTILINE)
+    assert re.search(
+        r"^Mean reward: \d", run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path), flags=re.MULTILINE
+    )
 
 
 def test_optimize_dqn_cchain(tmp_path):

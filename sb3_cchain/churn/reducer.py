@@ -66,25 +66,45 @@ class ChurnReducer(nn.Module):
         :param reference: Observations outside the minibatch of the update that is about to be made
         :raises ValueError: When the churn loss is NaN or infinite. The parameters have not been touched.
         """
-        outputs = self._outputs[0]
-        with th.no_grad():
-            next_old_outputs = outputs(reference)
-        if self.reference is not None and self.old_outputs is not None:
+        if self.reference is not None:
             with th.enable_grad():
-                new_outputs = outputs(self.reference)
-                churn_loss = self.divergence(self.old_outputs, new_outputs)
-            loss = churn_loss.item()
-            if not -float("inf") < loss < float("inf"):
-                raise ValueError(
-                    f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values. "
-                    "The parameters have not been updated. Lower the learning rate or `churn_coef`, or set `max_grad_norm`."
-                )
-            if not self.losses:  # λ changes between iterations only
-                self._coef = self.coefficient.value
-            (self._coef * churn_loss).backward()
-            self.losses.append(loss)
-            self.compared.append((self.old_outputs, new_outputs.detach()))
-        self.reference, self.old_outputs = reference, next_old_outputs
+                loss = self.loss(self._outputs[0](self.reference))
+            loss.backward()
+        self.remember(reference)
+
+    def loss(self, new_outputs: th.Tensor) -> th.Tensor:
+        """
+        For a training loop that has the outputs on ``self.reference`` from a forward pass of its own.
+
+        :param new_outputs: The present outputs on ``self.reference``, which must not be None
+        :return: λ·L_churn
+        :raises ValueError: When the churn loss is NaN or infinite
+        """
+        assert self.old_outputs is not None
+        churn_loss = self.divergence(self.old_outputs, new_outputs)
+        loss = churn_loss.item()
+        if not -float("inf") < loss < float("inf"):
+            raise ValueError(
+                f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values. "
+                "The parameters have not been updated. Lower the learning rate or `churn_coef`, or set `max_grad_norm`."
+            )
+        if not self.losses:  # λ changes between iterations only
+            self._coef = self.coefficient.value
+        self.losses.append(loss)
+        self.compared.append((self.old_outputs, new_outputs.detach()))
+        return self._coef * churn_loss
+
+    def remember(self, reference: Observations, outputs: th.Tensor | None = None) -> None:
+        """
+        Keep the present outputs on ``reference`` for the next update.
+
+        :param reference: Observations outside the minibatch of the update that is about to be made
+        :param outputs: The outputs, without gradient, where the training loop has them
+        """
+        if outputs is None:
+            with th.no_grad():
+                outputs = self._outputs[0](reference)
+        self.reference, self.old_outputs = reference, outputs
 
     def mean_churn(self) -> float:
         """

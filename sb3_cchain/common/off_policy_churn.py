@@ -1,13 +1,15 @@
 """Churn reduction of an unmodified ``DQN.train()``: where reference batches come from, where the gradient goes in."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch as th
 from stable_baselines3 import DQN
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient, mean_squared_difference
+from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.common.policy_outputs import as_it_acts, has_training_mode
+from sb3_cchain.common.replaced import replaced
 
 # β when `target_churn_ratio="auto"`: the paper's
 DEFAULT_TARGET_RATIO = 0.01
@@ -20,7 +22,7 @@ def make_q_reducer(model: DQN, make_coefficient: Callable[[float], ChurnCoeffici
     :return: The reducer of the Q-network's churn: the mean squared change of all action values
     """
     return ChurnReducer(
-        lambda observations: model.q_net(observations), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO)
+        lambda observations: model.policy.q_net(observations), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO)
     )
 
 
@@ -43,16 +45,17 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
     :param reducer: Its churn reducer
     :param batch_size: Size of the reference batches
     """
-    acting = (lambda: as_it_acts(model.policy)) if has_training_mode(model.policy) else nullcontext
     coef = reducer.coefficient.value
 
-    def backward() -> None:
+    def sample() -> Observations:
         assert model.replay_buffer is not None
-        reference = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env).observations
-        with acting():
-            reducer.backward(reference)
+        return model.replay_buffer.sample(batch_size, env=model._vec_normalize_env).observations
 
-    with extra_gradient(model.policy.optimizer, backward):
+    if has_training_mode(model.policy):
+        seam = _own_pass(model, reducer, sample)
+    else:
+        seam = _joint_passes(model, reducer, sample, batch_size)
+    with seam:
         yield
 
     if reducer.losses:
@@ -66,3 +69,57 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
         model.logger.record_mean("churn/value_churn", (new - old).abs().mean().item())
         model.logger.record_mean("churn/greedy_action_changes", greedy_action_changes.item())
         reducer.end_iteration(base_loss)
+
+
+@contextmanager
+def _own_pass(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations]) -> Iterator[None]:
+    """A forward and a backward pass for the reference batch, in which the network acts as it does in the environment."""
+
+    def backward() -> None:
+        reference = sample()
+        with as_it_acts(model.policy):
+            reducer.backward(reference)
+
+    with extra_gradient(model.policy.optimizer, backward):
+        yield
+
+
+@contextmanager
+def _joint_passes(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations], batch_size: int) -> Iterator[None]:
+    """
+    The same gradient, up to rounding, in no pass more than Double DQN makes: reference batches go through the network
+    together with the minibatch and its next observations, and the churn loss's gradient with respect to the outputs is
+    added where SB3's backward pass comes by.
+    """
+    q_net = model.q_net
+    upcoming: tuple[Observations, th.Tensor | None] | None = None  # the next reference batch, and the outputs on it
+
+    def joint_q_net(observations: Observations) -> th.Tensor:
+        """Called, with Double Q-learning, for the next observations without gradient; then for the observations."""
+        nonlocal upcoming
+        if not th.is_grad_enabled():
+            reference = sample()
+            outputs = q_net(_cat(observations, reference))
+            upcoming = reference, outputs[batch_size:]
+            return outputs[:batch_size]
+
+        if reducer.reference is None:
+            outputs = q_net(observations)
+        else:
+            outputs = q_net(_cat(observations, reducer.reference))
+            new_outputs = outputs[batch_size:].detach().requires_grad_()
+            (gradient,) = th.autograd.grad(reducer.loss(new_outputs), new_outputs)
+            outputs.register_hook(lambda of_minibatch: th.cat([of_minibatch[:batch_size], gradient]))
+        reducer.remember(*(upcoming or (sample(), None)))
+        upcoming = None
+        return outputs[:batch_size]
+
+    with replaced(model, "q_net", joint_q_net):
+        yield
+
+
+def _cat(minibatch: Observations, reference: Observations) -> Observations:
+    if isinstance(minibatch, dict) and isinstance(reference, dict):
+        return {key: th.cat([minibatch[key], reference[key]]) for key in minibatch}
+    assert th.is_tensor(minibatch) and th.is_tensor(reference)
+    return th.cat([minibatch, reference])

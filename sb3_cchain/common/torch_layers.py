@@ -33,7 +33,7 @@ class MinAtarCNN(BaseFeaturesExtractor):
         n_channels, height, width = shape if self.channels_first else (shape[2], *shape[:2])
         if min(height, width) < 3:
             raise ValueError(_NEEDS.format(observation_space))
-        self.cnn = nn.Sequential(nn.Conv2d(n_channels, 16, kernel_size=3), nn.ReLU(), nn.Flatten())
+        self.cnn = nn.Sequential(nn.Conv2d(n_channels, 16, kernel_size=3), nn.ReLU())
         self.linear = nn.Sequential(nn.Linear(16 * (height - 2) * (width - 2), features_dim), nn.ReLU())
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -41,4 +41,6 @@ class MinAtarCNN(BaseFeaturesExtractor):
         :param observations: A batch of them
         :return: Features ``(batch_size, features_dim)``
         """
-        return self.linear(self.cnn(observations if self.channels_first else observations.permute(0, 3, 1, 2)))
+        images = observations if self.channels_first else observations.permute(0, 3, 1, 2)
+        # Flattened in the order that they lie in memory, channels last, which spares a copy
+        return self.linear(self.cnn(images).permute(0, 2, 3, 1).flatten(start_dim=1))
