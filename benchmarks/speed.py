@@ -103,7 +103,11 @@ def minatar(n_past_updates: int = 0) -> Case:
     )
 
 
-CASES = {"gym_control": gym_control, "minatar": minatar, "minatar_later": partial(minatar, n_past_updates=50_000)}
+CASES: dict[str, Callable[[], Case]] = {
+    "gym_control": gym_control,
+    "minatar": minatar,
+    "minatar_later": partial(minatar, n_past_updates=50_000),
+}
 
 
 def seconds(call: Callable[[], Any]) -> float:
