@@ -7,12 +7,35 @@ Double DQN and C-CHAIN DQN on continual MinAtar: trains, and writes a table and 
 import argparse
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
+
 from benchmarks.report import report
 from benchmarks.runs import Run, complete
 
 ENV_ID = "Continual/MinAtar-v0"
 GAMES = ["SpaceInvaders", "Asterix", "Seaquest"]
 ALGOS = ["double_dqn", "dqn_cchain"]
+
+
+def random_return(game: str, n_episodes: int = 200) -> float:
+    """
+    :param game: A MinAtar game
+    :param n_episodes: Episodes
+    :return: Mean return of uniformly random actions
+    """
+    env = gym.make(ENV_ID, games=[game])
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    returns = []
+    for _ in range(n_episodes):
+        env.reset()
+        done = False
+        while not done:
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            done = terminated or truncated
+        returns.append(info["episode_return"])
+    return float(np.mean(returns))
 
 
 def main() -> None:
@@ -34,7 +57,8 @@ def main() -> None:
         for algo in args.algo
     ]
     complete(runs, args.jobs)
-    report(runs, folder, ENV_ID, Run.evaluations, window=1, task_names=GAMES)
+    random_returns = [random_return(game) for game in GAMES]
+    report(runs, folder, ENV_ID, Run.evaluations, random_returns, window=1, task_names=GAMES, own_scales=True)
 
 
 if __name__ == "__main__":

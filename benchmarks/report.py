@@ -1,7 +1,7 @@
 """Tables and learning curves of runs."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,27 +38,29 @@ def row_of(run: Run, returns: Returns = Run.returns) -> list[str]:
     :param returns: Which returns
     :return: Cells: algorithm, seed, average return of each task, mean over the tasks
     """
-    averages = averages_of(run, returns)
-    return [LABELS[run.algo], str(run.seed), *(_figure(average) for average in [*averages, float(np.mean(averages))])]
+    return [LABELS[run.algo], str(run.seed), *_figures(averages_of(run, returns))]
 
 
-def _figure(average: float) -> str:
-    return f"{average:.0f}" if abs(average) >= 100 else f"{average:.1f}"
+def _figures(averages: Sequence[float] | np.ndarray) -> list[str]:
+    """The averages of the tasks, and their mean."""
+    return [f"{average:.0f}" if abs(average) >= 100 else f"{average:.1f}" for average in [*averages, np.mean(averages)]]
 
 
-def markdown_table(runs: Sequence[Run], returns: Returns = Run.returns) -> str:
+def markdown_table(runs: Sequence[Run], returns: Returns = Run.returns, random_returns: Sequence[float] | None = None) -> str:
     """
     :param runs: Finished runs of one environment and length
     :param returns: Which returns
-    :return: A row per run, and one per algorithm with the mean over its seeds
+    :param random_returns: A random policy's return on each task
+    :return: A row per run, one per algorithm with the mean over its seeds, and one for the random policy
     """
     n_tasks = runs[0].n_tasks
     header = ["algorithm", "seed", *(f"task {task}" for task in range(n_tasks)), "J(T)"]
     lines = [header, ["---"] * len(header), *(row_of(run, returns) for run in runs)]
     for algo in dict.fromkeys(run.algo for run in runs):
         averages = np.mean([averages_of(run, returns) for run in runs if run.algo == algo], axis=0)
-        cells = [_figure(average) for average in [*averages, averages.mean()]]
-        lines.append([f"**{LABELS[algo]}**", "**mean**", *(f"**{cell}**" for cell in cells)])
+        lines.append([f"**{cell}**" for cell in (LABELS[algo], "mean", *_figures(averages))])
+    if random_returns is not None:
+        lines.append(["random policy", "", *_figures(random_returns)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -82,6 +84,8 @@ def plot_curves(
     window: int = 5,
     note: str = "",
     task_names: Sequence[str] | None = None,
+    random_returns: Sequence[float] | None = None,
+    own_scales: bool = False,
 ) -> None:
     """
     Draw the return of each rollout (or evaluation) against environment steps, a thin line per run, a thick one for the mean
@@ -94,46 +98,67 @@ def plot_curves(
     :param window: Rollouts that the running mean goes over, inside a task
     :param note: Small print under the picture
     :param task_names: Names of the tasks, by default their numbers
+    :param random_returns: A random policy's return on each task, drawn as a dotted line
+    :param own_scales: Whether each task has a panel with a scale of its own, where tasks differ in the size of their returns
     """
     plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
-    figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
-    by_algo: Mapping[str, list[Run]] = {algo: [run for run in runs if run.algo == algo] for algo in LABELS}
-    task_names = task_names or [f"task {task}" for task in range(runs[0].n_tasks)]
     n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
-    for algo, algo_runs in by_algo.items():
-        if not algo_runs:
-            continue
-        label: str | None = LABELS[algo] + (f", mean of {len(algo_runs)} seeds" if len(algo_runs) > 1 else "")
-        for task in range(n_tasks):
-            curves = []
-            grid = np.linspace(task * steps_per_task, (task + 1) * steps_per_task, 81)[1:]
-            for run in algo_runs:
-                rows = [row for row in returns(run) if row["task_id"] == task]
-                steps = np.array([row["timesteps"] for row in rows])
-                smooth = smoothed(np.array([row["mean_return"] for row in rows]), window)
-                curves.append(np.interp(grid, steps, smooth))
-                if len(algo_runs) > 1:
-                    axes.plot(steps, smooth, color=COLORS[algo], linewidth=0.6, alpha=0.5)
-            axes.plot(grid, np.mean(curves, axis=0), color=COLORS[algo], linewidth=2.2, label=label)
-            label = None
-    for task in range(n_tasks):
-        middle = (task + 0.5) * steps_per_task
-        axes.text(middle, 1.01, task_names[task], ha="center", va="bottom", transform=axes.get_xaxis_transform(), color="0.35")
-        if task > 0:
-            axes.axvline(task * steps_per_task, color="0.35", linestyle="--", linewidth=1)
-    axes.set(xlabel="environment steps", ylabel="return per episode", xlim=(0, n_tasks * steps_per_task))
-    axes.set_title(title, pad=20)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k" if value else "0")
-    figure.legend(loc="outside lower center", ncols=len(LABELS), frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    if note:
-        figure.supxlabel(note, fontsize=8, color="0.35")
+    task_names = task_names or [f"task {task}" for task in range(n_tasks)]
+    if own_scales:
+        figure, panels = plt.subplots(1, n_tasks, figsize=(9, 4.2), layout="constrained")
+    else:
+        figure, panel = plt.subplots(figsize=(9, 4.2), layout="constrained")
+        panels = [panel] * n_tasks
+    for task, axes in enumerate(panels):
+        start, end = task * steps_per_task, (task + 1) * steps_per_task
+        for algo in LABELS:
+            _draw(axes, [run for run in runs if run.algo == algo], task, returns, window)
+        if random_returns is not None:
+            axes.hlines(random_returns[task], start, end, color="0.35", linestyle=":", label="random policy")
+        at_middle = dict(ha="center", va="bottom", transform=axes.get_xaxis_transform(), color="0.35")
+        axes.text((start + end) / 2, 1.01, task_names[task], **at_middle)
+        if task > 0 and not own_scales:
+            axes.axvline(start, color="0.35", linestyle="--", linewidth=1)
+        axes.set_xlim(start if own_scales else 0, end)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k" if value else "0")
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("return per episode")
+    figure.suptitle(title)
+    figure.supxlabel("environment steps" + (f"\n{note}" if note else ""), fontsize=10)
+    handles, labels = panels[0].get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=len(legend), frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
 
-def report(runs: Sequence[Run], folder: Path, title: str, returns: Returns = Run.returns, **options: Any) -> None:
+def _draw(axes: Any, runs: Sequence[Run], task: int, returns: Returns, window: int) -> None:
+    """One task's returns under one algorithm."""
+    if not runs:
+        return
+    color = COLORS[runs[0].algo]
+    curves = []
+    for run in runs:
+        rows = [row for row in returns(run) if row["task_id"] == task]
+        steps = np.array([row["timesteps"] for row in rows])
+        curves.append((steps, smoothed(np.array([row["mean_return"] for row in rows]), window)))
+        if len(runs) > 1:
+            axes.plot(*curves[-1], color=color, linewidth=0.6, alpha=0.5)
+    grid = np.linspace(max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves), 80)
+    mean = np.mean([np.interp(grid, *curve) for curve in curves], axis=0)
+    label = LABELS[runs[0].algo] + (f", mean of {len(runs)} seeds" if len(runs) > 1 else "")
+    axes.plot(grid, mean, color=color, linewidth=2.2, label=label)
+
+
+def report(
+    runs: Sequence[Run],
+    folder: Path,
+    title: str,
+    returns: Returns = Run.returns,
+    random_returns: Sequence[float] | None = None,
+    **options: Any,
+) -> None:
     """
     Write ``table.md`` and ``curves.png``, and print the table.
 
@@ -141,10 +166,11 @@ def report(runs: Sequence[Run], folder: Path, title: str, returns: Returns = Run
     :param folder: Where they go
     :param title: Title of the picture
     :param returns: Which returns
-    :param options: Keyword arguments of :func:`plot_curves`
+    :param random_returns: A random policy's return on each task
+    :param options: Further keyword arguments of :func:`plot_curves`
     """
     runs = sorted(runs, key=lambda run: (list(LABELS).index(run.algo), run.seed))
-    table = markdown_table(runs, returns)
+    table = markdown_table(runs, returns, random_returns)
     (folder / "table.md").write_text(table + "\n")
-    plot_curves(runs, folder / "curves.png", title, returns, **options)
+    plot_curves(runs, folder / "curves.png", title, returns, random_returns=random_returns, **options)
     print(f"{table}\n\nWritten: {folder}/table.md, {folder}/curves.png")
