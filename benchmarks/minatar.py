@@ -18,7 +18,7 @@ GAMES = ["SpaceInvaders", "Asterix", "Seaquest"]
 ALGOS = ["double_dqn", "dqn_cchain"]
 
 
-def random_return(game: str, n_episodes: int = 200) -> float:
+def random_return(game: str, n_episodes: int = 1000) -> float:
     """
     :param game: A MinAtar game
     :param n_episodes: Episodes

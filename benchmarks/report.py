@@ -82,7 +82,6 @@ def plot_curves(
     title: str,
     returns: Returns = Run.returns,
     window: int = 5,
-    note: str = "",
     task_names: Sequence[str] | None = None,
     random_returns: Sequence[float] | None = None,
     own_scales: bool = False,
@@ -96,7 +95,6 @@ def plot_curves(
     :param title: Title
     :param returns: Which returns
     :param window: Rollouts that the running mean goes over, inside a task
-    :param note: Small print under the picture
     :param task_names: Names of the tasks, by default their numbers
     :param random_returns: A random policy's return on each task, drawn as a dotted line
     :param own_scales: Whether each task has a panel with a scale of its own, where tasks differ in the size of their returns
@@ -124,7 +122,7 @@ def plot_curves(
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("return per episode")
     figure.suptitle(title)
-    figure.supxlabel("environment steps" + (f"\n{note}" if note else ""), fontsize=10)
+    panels[n_tasks // 2].set_xlabel("environment steps")
     handles, labels = panels[0].get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=len(legend), frameon=False)
