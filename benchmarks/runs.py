@@ -80,7 +80,7 @@ class Run:
         """What determines the run: its hyperparameters and versions."""
         hyperparameters = yaml.safe_load((hyperparams_folder() / f"{self.algo}.yml").read_text())
         return {
-            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task, *self.env_kwargs],
+            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task, self.eval_freq, *self.env_kwargs],
             "hyperparameters": hyperparameters.get(self.env_id),
             "versions": {name: version(name) for name in ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")},
         }

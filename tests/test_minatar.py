@@ -121,6 +121,7 @@ def test_other_numbers_of_channels():
         ({"games": ["Asterix", "space_invaders"]}, ValueError, "Unknown game 'space_invaders' in `games`"),
         ({"games": [3]}, ValueError, "Unknown game 3 in `games`"),
         ({"games": "Asterix"}, TypeError, "`games` must be a list of games, got the string 'Asterix'"),
+        ({"games": 5}, TypeError, "`games` must be a list of games, got 5"),
         ({"games": []}, ValueError, "must name at least one task, got an empty list"),
         ({"steps_per_task": [10, 10]}, ValueError, r"`steps_per_task` must be one number or one per task \(3\)"),
         ({"n_channels": 9}, ValueError, "`n_channels` must be at least 10, the channels of .*MinAtar/Seaquest-v0.*, got 9"),
@@ -250,7 +251,8 @@ class Rewards(gym.Env):
     "rewards, truncated",
     [
         ([0, 0, 0, 0, 0], [False, False, True, True, True]),
-        ([1, 0, 0, 0, 0], [False] * 5),
+        ([1, 0, 0, 0, 0], [False, False, False, True, True]),
+        ([-1, 0, 0, 1, 0], [False] * 5),
         ([0, 0, 1, 0, 0], [False] * 5),
         ([0, 0, 0, 1, 0], [False, False, True, False, False]),
         ([0, 0], [False] * 2),

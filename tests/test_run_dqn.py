@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, HerReplayBuffer
-from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
+from sb3_cchain.common import off_policy_churn
 from sb3_cchain.common.torch_layers import MinAtarCNN
 from tests.envs import CountEnv, RandomEnv
 
@@ -77,7 +78,7 @@ def test_vectorised_and_normalised(vec_env_cls):
         (dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)), 30),
         (dict(learning_rate=lambda progress: 1e-3 * (1 + progress), tau=0.5, max_grad_norm=float("inf")), 30),
     ],
-    ids=str,
+    ids=["gradient steps", "as many as steps", "episodes", "n-step", "memory", "schedule"],
 )
 def test_other_arguments_of_dqn(arguments, n_updates):
     model = learn(**arguments)
@@ -103,26 +104,78 @@ class NormalisedExtractor(BaseFeaturesExtractor):
         return self.net(observations)
 
 
-def test_batch_norm_and_dropout_act_in_the_churn_loss_as_they_do_in_the_environment():
-    model = learn(policy_kwargs=dict(features_extractor_class=NormalisedExtractor))
-    assert_churn_was_reduced(model)
-    reducer, extractor = model.churn_reducer, model.q_net.features_extractor
-    running_mean = extractor.net[1].running_mean.clone()
-    model.q_net.eval()
-    with th.no_grad():
-        outputs = model.q_net(th.ones(8, 4))
-    model.q_net.train()
-    backward, seen = reducer.backward, []
-    reducer.backward = lambda reference: (backward(th.ones(8, 4)), seen.append((model.q_net.training, reducer.old_outputs)))
-    model.replay_buffer.observations[:] = model.replay_buffer.next_observations[:] = 0
+@pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+def test_batch_norm_and_dropout_act_as_in_the_environment(cls):
+    """Only the observations of a minibatch move the running statistics: not its next observations, nor reference batches."""
+    settings = {**SETTINGS, "policy_kwargs": dict(features_extractor_class=NormalisedExtractor)}
+    model = cls("MlpPolicy", RandomEnv(), **settings).learn(50, log_interval=10**6)
+    batches = []
+    norm = model.q_net.features_extractor.net[1]
+    norm.register_forward_pre_hook(lambda module, inputs: batches.append((module.training, inputs[0])))
+    n_batches = int(norm.num_batches_tracked)
+    model.replay_buffer.next_observations[:] = 0.5
     model.train(gradient_steps=1, batch_size=8)
-    # The reference batch of ones was seen in evaluation mode; only the minibatch of zeros moved the statistics
-    assert [training for training, _ in seen] == [False]
-    assert model.q_net.training
-    moved = extractor.net[1].running_mean
-    bias = extractor.net[0].bias
-    assert not th.equal(moved, running_mean) and outputs.shape == seen[0][1].shape == (8, 3)
-    assert (moved - bias).norm() < (running_mean - bias).norm()
+    assert model.q_net.training and norm.num_batches_tracked == n_batches + 1
+    ((_, trained_on),) = [batch for batch in batches if batch[0]]
+    assert th.unique(trained_on, dim=0).shape[0] > 1  # next observations are all the same
+    if cls is CChainDQN:
+        assert_churn_was_reduced(model)
+        # Next observations, and the reference batch twice (before this update, and of the one before)
+        assert len(batches) == 4
+
+
+def other_settings(name):
+    return {
+        "Box": dict(env=RandomEnv(), policy="MlpPolicy"),
+        "Dict": dict(env=RandomEnv(spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})), policy="MultiInputPolicy"),
+        "VecNormalize": dict(env=VecNormalize(make_vec_env(RandomEnv, n_envs=2, seed=0)), policy="MlpPolicy", n_steps=3),
+        "HER": dict(env=BitFlippingEnv(n_bits=4), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer),
+    }[name]
+
+
+@pytest.mark.parametrize("double_q", [False, True])
+@pytest.mark.parametrize("name", ["Box", "Dict", "VecNormalize", "HER"])
+def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, monkeypatch):
+    models = []
+    for own_pass in (False, True):
+        monkeypatch.setattr(off_policy_churn, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
+        models.append(learn(n_timesteps=80, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
+    for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.allclose(p, q, rtol=0, atol=1e-5)
+    together, alone = (model.logger.name_to_value for model in models)
+    assert all(together[key] == pytest.approx(alone[key], rel=1e-2) for key in CHURN_KEYS)
+
+
+class GenerousBuffer(ReplayBuffer):
+    """Twice as many samples as it is asked for."""
+
+    def sample(self, batch_size, env=None):
+        return super().sample(2 * batch_size, env)
+
+
+@pytest.mark.parametrize("double_q", [False, True])
+def test_a_replay_buffer_of_ones_own(double_q):
+    model = learn(replay_buffer_class=GenerousBuffer, double_q=double_q)
+    assert_churn_was_reduced(model)
+    assert len(model.churn_reducer.reference) == 16
+
+
+def test_an_interrupted_update_leaves_nothing_behind():
+    model = learn()
+    step = model.policy.optimizer.step
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    model.policy.optimizer.step = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        model.train(gradient_steps=1, batch_size=8)
+    model.policy.optimizer.step = step
+    assert model.q_net is model.policy.q_net and model.q_net_target is model.policy.q_net_target
+    n_seen = int(model.churn_reducer.coefficient.n_seen)
+    model.train(gradient_steps=3, batch_size=8)
+    assert model.churn_reducer.coefficient.n_seen == n_seen + 1
+    assert model.churn_reducer.losses == []
 
 
 def test_positional_arguments_are_those_of_dqn():
@@ -227,6 +280,7 @@ def test_other_actions_are_refused(cls, action_space):
     "arguments, error, message",
     [
         ({"loss": "mae"}, ValueError, """`loss` must be "huber" or "mse", got 'mae'"""),
+        ({"loss": ["mse"]}, ValueError, r"""`loss` must be "huber" or "mse", got \['mse'\]"""),
         ({"loss": None}, ValueError, """`loss` must be "huber" or "mse", got None"""),
         ({"double_q": "yes"}, TypeError, "`double_q` must be True or False, got 'yes'"),
     ],

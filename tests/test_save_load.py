@@ -1,5 +1,7 @@
 """Saved and loaded, training goes on as if it had never stopped."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,6 +10,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cchain import CChainPPO
+from sb3_cchain.common.policy_outputs import policy_outputs
 from tests.envs import RandomEnv
 
 SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu", churn_warmup=2, churn_window=4)
@@ -71,6 +74,25 @@ def test_a_fixed_coefficient_takes_over_from_an_adaptive_one(tmp_path):
     loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", churn_coef=0.0)
     assert loaded.churn_reducer.coefficient.is_zero
     loaded.learn(32)
+
+
+@pytest.mark.parametrize("coef", [0.0, 0.5])
+def test_an_adaptive_coefficient_takes_over_from_a_fixed_one(tmp_path, coef):
+    CChainPPO("MlpPolicy", make_env(), churn_coef=coef, **SETTINGS).learn(32).save(tmp_path / "model")
+    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", churn_coef="auto_3")
+    assert loaded.churn_reducer.coefficient.value == 3
+    loaded.learn(32)
+
+
+def test_a_copy_of_the_model_has_a_network_of_its_own():
+    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)  # SB3's PPO cannot be copied once it was trained
+    copied = copy.deepcopy(model)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(1.0)
+    reducer, observations = copied.churn_reducer, th.ones(2, 4)
+    reducer.remember(observations)
+    assert th.equal(reducer.old_outputs, policy_outputs(copied.policy, observations).detach())
 
 
 def test_another_window_starts_over(tmp_path):

@@ -1,5 +1,7 @@
 """Saved and loaded, training goes on as if it had never stopped."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -72,6 +74,33 @@ def test_arguments_can_be_changed_on_loading(tmp_path):
     assert (loaded.loss, loaded.double_q) == ("mse", False)
     assert loaded.churn_reducer.coefficient.value == 50  # another window starts over
     loaded.learn(50)
+
+
+@pytest.mark.parametrize("before, after, value", [(0.5, "auto_3", 3), ("auto", 0.5, 0.5), (0.0, "auto_3", 3)])
+def test_another_kind_of_coefficient_starts_over(tmp_path, before, after, value):
+    CChainDQN("MlpPolicy", RandomEnv(), churn_coef=before, **SETTINGS).learn(50).save(tmp_path / "model")
+    loaded = CChainDQN.load(tmp_path / "model", env=RandomEnv(), device="cpu", churn_coef=after)
+    assert loaded.churn_reducer.coefficient.value == value
+    loaded.learn(50)
+
+
+@pytest.mark.parametrize("argument, error", [({"loss": "mae"}, ValueError), ({"double_q": "yes"}, TypeError)])
+def test_bad_arguments_on_loading(tmp_path, argument, error):
+    DoubleDQN("MlpPolicy", RandomEnv(), device="cpu").save(tmp_path / "model")
+    ((name, value),) = argument.items()
+    with pytest.raises(error, match=f"`{name}` must be .* got {value!r}"):
+        DoubleDQN.load(tmp_path / "model", env=RandomEnv(), device="cpu", **argument)
+
+
+def test_a_copy_of_the_model_has_a_network_of_its_own():
+    model = CChainDQN("MlpPolicy", RandomEnv(), **SETTINGS).learn(50)
+    copied = copy.deepcopy(model)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(1.0)
+    observations = th.ones(2, 4)
+    copied.churn_reducer.remember(observations)
+    assert th.equal(copied.churn_reducer.old_outputs, copied.q_net(observations).detach())
 
 
 def test_predicts_without_an_environment(tmp_path):

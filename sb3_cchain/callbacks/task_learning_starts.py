@@ -12,6 +12,8 @@ class TaskLearningStarts(BaseCallback):
     ``learning_starts`` of an off-policy algorithm at the beginning of each task: random actions and no updates, as in the
     continual MinAtar experiments of the C-CHAIN paper. SB3 does so at the beginning of training alone.
 
+    A switch in the middle of a rollout is followed from the next rollout on, up to ``train_freq - 1`` steps late.
+
     All else goes on over a switch: replay buffer, exploration rate, optimiser. It is the one thing in that protocol
     that needs to know of a switch.
 

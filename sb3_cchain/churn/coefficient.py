@@ -99,17 +99,15 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         :param base_loss: The loss that the churn loss is added to; its absolute value counts
         :param churn_loss: The churn loss, not multiplied by λ; its absolute value counts
         """
-        n_seen = int(self.n_seen)
-        for index, (losses, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
-            # Views of the buffers' memory: an element is written in a fraction of the time that it takes a tensor
-            history, sums = losses.numpy(), self.sums.numpy()
-            slot = n_seen % len(history)
-            forgotten, history[slot] = history[slot], abs(loss)
-            sums[index] += abs(loss) - forgotten
-            # Anew once per window, and when most of it leaves: else rounding errors would add up, or outlive their cause
-            if slot == len(history) - 1 or forgotten > sums[index]:
-                sums[index] = history.sum()
-        self.n_seen.fill_(n_seen + 1)
+        slot = int(self.n_seen) % len(self.base_losses)
+        for index, (history, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
+            forgotten = float(history[slot])
+            history[slot] = abs(loss)
+            self.sums[index] += abs(loss) - forgotten
+            # Anew once per window, and when most of it leaves, so that rounding errors neither add up nor stay behind
+            if slot == len(history) - 1 or forgotten > self.sums[index]:
+                self.sums[index] = history.sum()
+        self.n_seen += 1
 
     def reset(self) -> None:
         """Forget the losses seen and begin a new warm-up."""

@@ -126,6 +126,10 @@ class ChurnReducer(nn.Module):
         """
         if self.losses:
             self.coefficient.update(base_loss, sum(self.losses) / len(self.losses))
+        self.discard_losses()
+
+    def discard_losses(self) -> None:
+        """Forget the losses since the last ``end_iteration()``, as when training was interrupted in between."""
         self.losses, self.compared = [], []
 
     def forget_reference(self) -> None:

@@ -109,7 +109,11 @@ class ChurnAlgorithm(BaseAlgorithm):
         # Without a history of their own, the parameters are those of a network that has not churned yet
         fresh = self._make_churn_reducer().state_dict()
         state = params.get("churn_reducer", fresh)
-        if any(th.is_tensor(state[key]) and state[key].shape != getattr(fresh.get(key), "shape", None) for key in state):
+        if _shapes(state) != _shapes(fresh):
             state = {**fresh, "_extra_state": state["_extra_state"]}
         super().set_parameters({**params, "churn_reducer": state}, exact_match, device)
         self.churn_reducer.move_reference(self.device)
+
+
+def _shapes(state: dict[str, Any]) -> dict[str, th.Size]:
+    return {key: value.shape for key, value in state.items() if th.is_tensor(value)}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import torch as th
 from stable_baselines3 import DQN
@@ -21,9 +22,12 @@ def make_q_reducer(model: DQN, make_coefficient: Callable[[float], ChurnCoeffici
     :param make_coefficient: Makes λ, given the default β
     :return: The reducer of the Q-network's churn: the mean squared change of all action values
     """
-    return ChurnReducer(
-        lambda observations: model.policy.q_net(observations), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO)
-    )
+    # A partial, which deepcopy() of the model follows, as it does not a closure
+    return ChurnReducer(partial(_q_values, model), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO))
+
+
+def _q_values(model: DQN, observations: Observations) -> th.Tensor:
+    return model.policy.q_net(observations)
 
 
 @contextmanager
@@ -45,6 +49,7 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
     :param reducer: Its churn reducer
     :param batch_size: Size of the reference batches
     """
+    reducer.discard_losses()  # of an update that was interrupted
     coef = reducer.coefficient.value
 
     def sample() -> Observations:
@@ -54,7 +59,7 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
     if has_training_mode(model.policy):
         seam = _own_pass(model, reducer, sample)
     else:
-        seam = _joint_passes(model, reducer, sample, batch_size)
+        seam = _joint_passes(model, reducer, sample)
     with seam:
         yield
 
@@ -85,11 +90,12 @@ def _own_pass(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observatio
 
 
 @contextmanager
-def _joint_passes(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations], batch_size: int) -> Iterator[None]:
+def _joint_passes(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations]) -> Iterator[None]:
     """
     The same gradient, up to rounding, in no pass more than Double DQN makes: reference batches go through the network
     together with the minibatch and its next observations, and the churn loss's gradient with respect to the outputs is
-    added where SB3's backward pass comes by.
+    added where SB3's backward pass comes by. (Without Double Q-learning the next observations do not go through the network;
+    the old outputs then take a pass without gradient.)
     """
     q_net = model.q_net
     upcoming: tuple[Observations, th.Tensor | None] | None = None  # the next reference batch, and the outputs on it
@@ -99,20 +105,21 @@ def _joint_passes(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observ
         nonlocal upcoming
         if not th.is_grad_enabled():
             reference = sample()
-            outputs = q_net(_cat(observations, reference))
-            upcoming = reference, outputs[batch_size:]
-            return outputs[:batch_size]
+            q_values, outputs = _split(q_net(_cat(observations, reference)), observations)
+            upcoming = reference, outputs
+            return q_values
 
         if reducer.reference is None:
-            outputs = q_net(observations)
+            q_values = q_net(observations)
         else:
-            outputs = q_net(_cat(observations, reducer.reference))
-            new_outputs = outputs[batch_size:].detach().requires_grad_()
-            (gradient,) = th.autograd.grad(reducer.loss(new_outputs), new_outputs)
-            outputs.register_hook(lambda of_minibatch: th.cat([of_minibatch[:batch_size], gradient]))
+            both = q_net(_cat(observations, reducer.reference))
+            q_values, outputs = _split(both, observations)
+            outputs = outputs.detach().requires_grad_()
+            (gradient,) = th.autograd.grad(reducer.loss(outputs), outputs)
+            both.register_hook(lambda of_both: th.cat([of_both[: -len(gradient)], gradient]))
         reducer.remember(*(upcoming or (sample(), None)))
         upcoming = None
-        return outputs[:batch_size]
+        return q_values
 
     with replaced(model, "q_net", joint_q_net):
         yield
@@ -123,3 +130,8 @@ def _cat(minibatch: Observations, reference: Observations) -> Observations:
         return {key: th.cat([minibatch[key], reference[key]]) for key in minibatch}
     assert th.is_tensor(minibatch) and th.is_tensor(reference)
     return th.cat([minibatch, reference])
+
+
+def _split(outputs: th.Tensor, minibatch: Observations) -> tuple[th.Tensor, th.Tensor]:
+    size = len(next(iter(minibatch.values())) if isinstance(minibatch, dict) else minibatch)
+    return outputs[:size], outputs[size:]

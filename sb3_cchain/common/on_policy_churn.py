@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,14 @@ def make_policy_reducer(model: OnPolicyAlgorithm, make_coefficient: Callable[[fl
     """
     divergence = policy_divergence(model.policy)
     return ChurnReducer(
-        lambda observations: policy_outputs(model.policy, observations),
+        partial(_outputs, model),  # which deepcopy() of the model follows, as it does not a closure
         divergence,
         make_coefficient(DEFAULT_TARGET_RATIO[divergence]),
     )
+
+
+def _outputs(model: OnPolicyAlgorithm, observations: PyTorchObs) -> th.Tensor:
+    return policy_outputs(model.policy, observations)
 
 
 class ReferenceBatches:
@@ -95,6 +100,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
     policy, rollout_buffer = model.policy, model.rollout_buffer
     references = ReferenceBatches(rollout_buffer.get)
     acting = (lambda: as_it_acts(policy)) if has_training_mode(policy) else nullcontext
+    reducer.discard_losses()  # of an iteration that was interrupted
     coef = reducer.coefficient.value
     old_values: th.Tensor | None = None
     value_churns: list[float] = []

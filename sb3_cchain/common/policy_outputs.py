@@ -1,4 +1,4 @@
-"""The outputs of an SB3 actor-critic policy whose churn is measured, by kind of action distribution."""
+"""The outputs of an SB3 actor-critic policy whose churn is measured, by kind of action distribution; how any policy acts."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from types import FunctionType, SimpleNamespace
 from typing import Any, TypeVar
 
@@ -13,22 +14,20 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch.nn import functional as F
 
+from sb3_cchain.common.policy_outputs import as_it_acts, has_training_mode
 from sb3_cchain.common.replaced import replaced
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
-# SB3's own training step for another loss: the same code, for which the name `F` stands for something else.
-# Whatever a release of SB3 changes there is changed here too; a loss that it takes from elsewhere raises an AttributeError.
-_TRAIN: dict[str, Callable[..., None]] = {
-    "huber": DQN.train,
-    "mse": FunctionType(
-        DQN.train.__code__,
-        {**DQN.train.__globals__, "F": SimpleNamespace(smooth_l1_loss=F.mse_loss)},
-        DQN.train.__name__,
-        DQN.train.__defaults__,
-        DQN.train.__closure__,
-    ),
-}
+# SB3's own training step for another loss: the same code, for which the name `F` stands for something else. Whatever a release
+# of SB3 changes there is changed here too; another function of `F` raises an AttributeError.
+_train_mse = FunctionType(
+    DQN.train.__code__,
+    {**DQN.train.__globals__, "F": SimpleNamespace(smooth_l1_loss=F.mse_loss)},
+    DQN.train.__name__,
+    DQN.train.__defaults__,
+    DQN.train.__closure__,
+)
 
 
 class DoubleDQN(DQN):
@@ -60,19 +59,23 @@ class DoubleDQN(DQN):
         loss: str = "huber",
         **kwargs: Any,
     ):
-        if not isinstance(double_q, bool):
-            raise TypeError(f"`double_q` must be True or False, got {double_q!r}")
-        if loss not in _TRAIN:
-            raise ValueError(f'`loss` must be "huber" or "mse", got {loss!r}')
         self.double_q = double_q
         self.loss = loss
+        self._check_arguments()  # before an environment is made
         if env is not None:  # as when a model is loaded without one
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             if not isinstance(env.action_space, spaces.Discrete):
                 raise TypeError(f"{type(self).__name__} needs an environment with Discrete actions, got {env.action_space}")
         super().__init__(policy, env, *args, **kwargs)
 
+    def _check_arguments(self) -> None:
+        if not isinstance(self.double_q, bool):
+            raise TypeError(f"`double_q` must be True or False, got {self.double_q!r}")
+        if self.loss not in ("huber", "mse"):
+            raise ValueError(f'`loss` must be "huber" or "mse", got {self.loss!r}')
+
     def _setup_model(self) -> None:
+        self._check_arguments()  # again: `load()` may have changed them
         if self.n_steps > 1 and self.replay_buffer_class is None and isinstance(self.observation_space, spaces.Dict):
             raise ValueError(f"SB3 has n-step returns for Dict observations not yet: set `n_steps=1`, got {self.n_steps!r}")
         super()._setup_model()
@@ -86,11 +89,18 @@ class DoubleDQN(DQN):
         """
         double_q = replaced(self, "q_net_target", self._double_q_values(self.q_net_target)) if self.double_q else nullcontext()
         with double_q:
-            _TRAIN[self.loss](self, gradient_steps, batch_size)
+            if self.loss == "mse":
+                _train_mse(self, gradient_steps, batch_size)
+            else:
+                super().train(gradient_steps, batch_size)
 
     def _double_q_values(self, q_net_target: QNetwork) -> Callable[[PyTorchObs], th.Tensor]:
+        # As the target network: with running BatchNorm statistics, which next observations do not move, and without dropout
+        acting = partial(as_it_acts, self.policy) if has_training_mode(self.policy) else nullcontext
+
         def values(next_observations: PyTorchObs) -> th.Tensor:
-            greedy_actions = self.q_net(next_observations).argmax(dim=1, keepdim=True)
+            with acting():
+                greedy_actions = self.q_net(next_observations).argmax(dim=1, keepdim=True)
             # (batch_size, 1): DQN takes the maximum over the columns, of which there is one
             return q_net_target(next_observations).gather(1, greedy_actions)
 

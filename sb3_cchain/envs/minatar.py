@@ -54,7 +54,7 @@ class ChannelPadding(gym.ObservationWrapper):
 
 class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     """
-    Truncates an episode once it has lasted for a number of steps without any reward since its beginning.
+    Truncates an episode after a number of steps in a row without reward.
 
     :param env: The environment
     :param n_steps: The number of steps
@@ -72,8 +72,7 @@ class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         :param options: Passed on
         :return: Observation and info
         """
-        self._elapsed_steps = 0
-        self._rewarded = False
+        self._unrewarded_steps = 0
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -82,9 +81,8 @@ class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         :return: Observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._elapsed_steps += 1
-        self._rewarded = self._rewarded or reward != 0
-        truncated = truncated or (not self._rewarded and self._elapsed_steps >= self.n_steps)
+        self._unrewarded_steps = 0 if reward else self._unrewarded_steps + 1
+        truncated = truncated or self._unrewarded_steps >= self.n_steps
         return observation, reward, terminated, truncated, info
 
 
@@ -142,8 +140,8 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     Continual MinAtar (Section 5 of the C-CHAIN paper and its appendix on continual MinAtar): a task is a game.
 
     All games have the same six actions, and observations of 10 × 10 cells padded to the same number of boolean channels.
-    An episode of Seaquest is truncated after 1000 steps if it has brought no reward so far, as in the released code: at the
-    surface it would never end.
+    An episode of Seaquest is truncated after 1000 steps in a row without reward: at the surface it would never end. The
+    released code does so after the first 1000 steps only, which leaves the submarine that surfaces for good later.
 
     :param games: The games in order, from Asterix, Breakout, Freeway, Seaquest and SpaceInvaders; a game may come again
     :param steps_per_task: Environment steps per task, one number for all or one per task
@@ -153,7 +151,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: As in :func:`gymnasium.make`
-    :raises TypeError: When ``games`` is a string
+    :raises TypeError: When ``games`` is a string, or no list
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When MinAtar is not installed
     """
@@ -180,7 +178,10 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
 def _check_games(games: Sequence[str]) -> list[str]:
     if isinstance(games, str):
         raise TypeError(f"`games` must be a list of games, got the string {games!r}")
-    games = list(games)
+    try:
+        games = list(games)
+    except TypeError:
+        raise TypeError(f"`games` must be a list of games, got {games!r}") from None
     for game in games:
         if game not in GAMES:
             raise ValueError(f"Unknown game {game!r} in `games`; it must be one of {', '.join(GAMES)}")
