@@ -41,7 +41,8 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
 
     - ``churn/loss``: mean churn loss L_churn over the updates, the mean squared change of all action values
     - ``churn/coef``: the λ it was multiplied by
-    - ``churn/relative_loss``: λ·L_churn / L, which an adaptive λ holds near β; L is the TD loss
+    - ``churn/relative_loss``: λ·L_churn / L, where L is the TD loss. The mean of the ratios of single updates lies above the
+      ratio of the means, which an adaptive λ holds at β
     - ``churn/value_churn``: mean absolute change of the action values by an update
     - ``churn/greedy_action_changes``: share of the states whose greedy action an update changed
 
