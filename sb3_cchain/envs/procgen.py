@@ -1,0 +1,449 @@
+"""Continual ProcGen: a chain of levels of one game."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.validation import check_number
+
+if TYPE_CHECKING:
+    from procgen import ProcgenGym3Env
+
+# Procgen's own names, here so that it need not be installed to know them
+GAMES = (
+    "bigfish",
+    "bossfight",
+    "caveflyer",
+    "chaser",
+    "climber",
+    "coinrun",
+    "dodgeball",
+    "fruitbot",
+    "heist",
+    "jumper",
+    "leaper",
+    "maze",
+    "miner",
+    "ninja",
+    "plunder",
+    "starpilot",
+)
+# The games of each mode. Procgen ends the process where a game does not have the mode. Its "exploration" is left out: it is
+# the hard mode on one certain level, which leaves no choice of levels.
+DISTRIBUTION_MODES = {
+    "easy": GAMES,
+    "hard": GAMES,
+    "extreme": ("chaser", "dodgeball", "leaper", "starpilot"),
+    "memory": ("caveflyer", "dodgeball", "heist", "jumper", "maze", "miner"),
+}
+N_ACTIONS = 15
+# For procgen an action too: a step without movement, after which it begins a new episode
+NEW_EPISODE = -1
+MAX_LEVEL = 2**31 - 1
+
+
+class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
+    """
+    One game of procgen.
+
+    Procgen begins the next episode by itself, within the step that ends one, and never shows how that one ended. So the
+    observation at an episode's end is the one before its last step: there is no later one of that episode. What procgen gives
+    is the next episode's first, perhaps of another level. No value is taken of either, as the episode is over.
+
+    The ``reset()`` that follows returns the first observation of the episode that has already begun. One in the middle of an
+    episode makes procgen begin another, as it does itself, after a step without movement that is not seen.
+
+    Procgen has time limits of its own (1000 steps unless a game sets another) and does not say that one was reached: every end
+    is ``terminated``, as in procgen's own interface.
+
+    A reset with a seed determines which levels come next. Nothing else is left to chance: the same actions in the same level
+    make the same episode. With ``num_levels=1``, therefore, all episodes begin alike and the seed has no effect. (There is one
+    exception: after a reset without a seed Dodgeball's player faces where it last went in the episode before.)
+
+    Frames (``render_mode="rgb_array"``) have 512 × 512 pixels and make a step tens of times slower.
+
+    :param game: The game, by procgen's name for it
+    :param start_level: The first of its levels
+    :param num_levels: From how many levels, beginning with that, each episode's is drawn; 0 is all there are
+    :param distribution_mode: ``"easy"`` or ``"hard"``; some games have ``"extreme"`` or ``"memory"``
+    :param render_mode: ``"rgb_array"`` or ``None``
+    :raises ValueError: Naming the argument that is out of its range
+    :raises ImportError: When procgen is not installed
+    """
+
+    # The frames per second are those of procgen's own display
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012
+
+    def __init__(
+        self,
+        game: str,
+        *,
+        start_level: int = 0,
+        num_levels: int = 0,
+        distribution_mode: str = "hard",
+        render_mode: str | None = None,
+    ):
+        _check_game(game, distribution_mode)
+        check_number("num_levels", num_levels, 0, MAX_LEVEL, integer=True)
+        check_number("start_level", start_level, 0, MAX_LEVEL - num_levels, integer=True)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"`render_mode` must be None or 'rgb_array', got {render_mode!r}")
+        _import_procgen()
+        self.observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+        self.action_space = spaces.Discrete(N_ACTIONS)
+        self.render_mode = render_mode
+        self._settings = {
+            "env_name": game,
+            "start_level": int(start_level),
+            "num_levels": int(num_levels),
+            "distribution_mode": distribution_mode,
+        }
+        # Begun at the first reset, so that tasks far ahead cost nothing
+        self._game: ProcgenGym3Env | None = None
+        # Of the episode that procgen has begun and reset() has not
+        self._next_observation: NDArray[np.uint8] | None = None
+        self._frame: NDArray[np.uint8] | None = None
+
+    def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> "ProcgenGym3Env":
+        """
+        :param n_games: How many games are to run side by side
+        :param rand_seed: From 0 to 2³¹ - 1
+        :param kwargs: Further arguments of ``ProcgenGym3Env``
+        :return: Procgen itself, with this game's settings; to be closed by the caller
+        """
+        return _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """
+        Begin an episode; after the end of one, that which procgen has begun.
+
+        :param seed: Determines the levels of this and all later episodes. Procgen is launched anew, as it takes no seed later.
+        :param options: Not used
+        :return: Observation and info
+        """
+        super().reset(seed=seed)
+        if seed is not None or self._game is None:
+            self.close()
+            # Procgen's seeds have 31 bits, Gymnasium's any number
+            rand_seed = int(self.np_random.integers(2**31))
+            self._game = self.launch(1, rand_seed, num_threads=0, render_mode=self.render_mode)
+            self._next_observation = self._game.observe()[1]["rgb"][0]
+        elif self._next_observation is None:
+            self._game.act(np.array([NEW_EPISODE]))
+            self._next_observation = self._game.observe()[1]["rgb"][0]
+        self._observation: NDArray[np.uint8] = self._next_observation
+        self._next_observation = None
+        self._draw()
+        return self._observation, {}
+
+    def step(self, action: np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        """
+        One step, which procgen makes of one frame.
+
+        :param action: From 0 to 14
+        :return: Observation, reward, terminated, truncated (never), info
+        :raises ValueError: For any other action
+        :raises gymnasium.error.ResetNeeded: Before the first ``reset()`` and after the end of an episode
+        """
+        if self._game is None or self._next_observation is not None:
+            raise gym.error.ResetNeeded("Call reset() before step()")
+        if not 0 <= action < N_ACTIONS:
+            raise ValueError(f"An action must be an integer between 0 and {N_ACTIONS - 1}, got {action!r}")
+        self._game.act(np.array([action]))
+        rewards, observations, ended = self._game.observe()
+        terminated = bool(ended[0])
+        if terminated:
+            self._next_observation = observations["rgb"][0]
+            self._observation = self._observation.copy()  # has been given away before
+        else:
+            self._observation = observations["rgb"][0]
+            self._draw()
+        return self._observation, float(rewards[0]), terminated, False, {}
+
+    def _draw(self) -> None:
+        # At each step, as at an episode's end procgen would draw the next episode
+        if self.render_mode is not None and self._game is not None:
+            self._frame = self._game.get_info()[0]["rgb"]
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """
+        :return: The frame ``(512, 512, 3)`` of the last observation, ``None`` without a render mode
+        """
+        return self._frame
+
+    def close(self) -> None:
+        """End the game. A ``reset()`` begins another."""
+        if self._game is not None:
+            self._game.close()
+        self._game = self._next_observation = None
+
+
+class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
+    """
+    Continual ProcGen (Section 5 of the C-CHAIN paper, after TRAC): a task is another level of the same game.
+
+    Task ``i`` is the level ``first_level + i``; with more levels per task, each task has as many new ones.
+
+    :param game: The game, by procgen's name for it: bigfish, bossfight, caveflyer, chaser, climber, coinrun, dodgeball,
+        fruitbot, heist, jumper, leaper, maze, miner, ninja, plunder or starpilot
+    :param n_tasks: Length of the sequence
+    :param steps_per_task: Environment steps per task, one number for all or one per task
+    :param first_level: The first level of the first task; read back, with all others, as the attribute ``levels``
+    :param num_levels: Levels per task, from which each episode's is drawn
+    :param distribution_mode: See :class:`~sb3_cchain.envs.ProcgenGame`
+    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
+    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param render_mode: ``"rgb_array"`` or ``None``; ``gymnasium.make`` takes ``"human"`` too
+    :raises ValueError: Naming the argument that is out of its range
+    :raises ImportError: When procgen is not installed
+    """
+
+    metadata: dict[str, Any] = ProcgenGame.metadata
+
+    def __init__(
+        self,
+        game: str,
+        *,
+        n_tasks: int = 5,
+        steps_per_task: int | Sequence[int] = 2_000_000,
+        first_level: int = 20,
+        num_levels: int = 1,
+        distribution_mode: str = "hard",
+        n_envs: int = 1,
+        first_task: int = 0,
+        render_mode: str | None = None,
+    ):
+        _check_game(game, distribution_mode)
+        check_number("n_tasks", n_tasks, 1, integer=True)
+        check_number("num_levels", num_levels, 1, MAX_LEVEL // n_tasks, integer=True)
+        check_number("first_level", first_level, 0, MAX_LEVEL - n_tasks * num_levels, integer=True)
+        self.game = game
+        starts = [int(first_level + task * num_levels) for task in range(n_tasks)]
+        self.levels = [range(start, start + int(num_levels)) for start in starts]
+        make_task = partial(ProcgenGame, game, num_levels=num_levels, distribution_mode=distribution_mode)
+        tasks = [partial(make_task, start_level=start) for start in starts]
+        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+
+
+class _Sequence(ContinualProcgen):
+    """The tasks and the clock of a :class:`ContinualProcgenVecEnv`; itself it plays no game."""
+
+    def advance(self, n_steps: int) -> bool:
+        """
+        :param n_steps: Steps made
+        :return: Whether the task is over
+        """
+        self._total_steps += n_steps
+        return not self._pinned and self._due_task() != self._task_id
+
+    def enter(self) -> None:
+        """Go to the task that is due."""
+        self._task_id = self._due_task()
+
+
+class ContinualProcgenVecEnv(VecEnv):
+    """
+    Many instances of :class:`~sb3_cchain.envs.ContinualProcgen` as one vectorised environment of Stable-Baselines3. Procgen
+    steps them all in one call, in threads of its own.
+
+    They share one clock: the step at which they have together made a task's number of steps truncates all their episodes.
+    :class:`~sb3_cchain.callbacks.TaskSync` works with it as with others; ``set_task`` acts from the next ``reset()`` on.
+
+    Episodes are not recorded: wrap it in ``VecMonitor`` for that, as ``Monitor`` is for single environments. Frames
+    (``render_mode="rgb_array"``) are the observations.
+
+    :param game: See :class:`~sb3_cchain.envs.ContinualProcgen`
+    :param n_envs: Number of instances
+    :param num_threads: Procgen's threads; 0 steps the instances in the thread that calls
+    :param render_mode: ``"rgb_array"`` or ``None``
+    :param kwargs: Further arguments of :class:`~sb3_cchain.envs.ContinualProcgen`
+    :raises ValueError: Naming the argument that is out of its range
+    :raises ImportError: When procgen is not installed
+    """
+
+    def __init__(self, game: str, n_envs: int, *, num_threads: int = 4, render_mode: str | None = None, **kwargs: Any):
+        check_number("num_threads", num_threads, 0, integer=True)
+        self._sequence = _Sequence(game, n_envs=n_envs, render_mode=render_mode, **kwargs)
+        super().__init__(int(n_envs), self._sequence.observation_space, self._sequence.action_space)
+        self._num_threads = int(num_threads)
+        self._games: ProcgenGym3Env | None = None
+        self._rng: np.random.Generator | None = None
+        self._observations = np.zeros((self.num_envs, *self.observation_space.shape), dtype=np.uint8)  # type: ignore[misc]
+        self._returns = np.zeros(self.num_envs)
+
+    def reset(self) -> NDArray[np.uint8]:
+        """
+        Begin an episode of the task that is due in all instances.
+
+        After ``seed()``, the first instance's seed determines all that follows.
+
+        :return: Observations ``(n_envs, 64, 64, 3)``
+        """
+        seed = self._seeds[0]
+        if seed is not None or self._rng is None:
+            self._rng, _ = seeding.np_random(seed)
+        self._reset_seeds()
+        self._reset_options()
+        before = self._sequence.task_id
+        self._sequence.enter()
+        if seed is not None or self._games is None or self._sequence.task_id != before:
+            self._launch()
+        else:
+            self._games.act(np.full(self.num_envs, NEW_EPISODE))
+            self._observations = self._games.observe()[1]["rgb"]
+        self._begin_episodes(range(self.num_envs))
+        return self._observations.copy()
+
+    def _launch(self) -> None:
+        self.close()
+        assert self._rng is not None
+        task = self._sequence.task
+        assert isinstance(task, ProcgenGame)
+        self._games = task.launch(self.num_envs, int(self._rng.integers(2**31)), num_threads=self._num_threads)
+        self._observations = self._games.observe()[1]["rgb"]
+
+    def _begin_episodes(self, indices: Sequence[int] | NDArray[np.int64]) -> None:
+        for index in indices:
+            self.reset_infos[index] = {"task_id": self._sequence.task_id}
+            self._returns[index] = 0.0
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """
+        Begin a step of all instances.
+
+        :param actions: From 0 to 14, ``(n_envs,)``
+        :raises ValueError: For any other actions
+        :raises gymnasium.error.ResetNeeded: Before the first ``reset()``
+        """
+        if self._games is None:
+            raise gym.error.ResetNeeded("Call reset() before step()")
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= N_ACTIONS:
+            raise ValueError(f"Actions must be {self.num_envs} integers between 0 and {N_ACTIONS - 1}, got {actions!r}")
+        self._games.act(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        End the step.
+
+        :return: Observations ``(n_envs, 64, 64, 3)``, rewards, ends of episodes, infos
+        """
+        assert self._games is not None
+        rewards, all_observations, terminated = self._games.observe()
+        observations = all_observations["rgb"]
+        self._returns += rewards
+        task_id = self._sequence.task_id
+        switch = self._sequence.advance(self.num_envs)
+        dones = np.logical_or(terminated, switch)
+        infos: list[dict[str, Any]] = [
+            {"task_id": task_id, "episode_return": episode_return, "TimeLimit.truncated": switch and not end}
+            for episode_return, end in zip(self._returns.tolist(), terminated.tolist(), strict=True)
+        ]
+        ended = np.flatnonzero(dones)
+        for index in ended:
+            # As in ProcgenGame: at an episode's own end what procgen gives is of the next
+            last = self._observations if terminated[index] else observations
+            infos[index]["terminal_observation"] = last[index]
+        self._observations = observations
+        if switch:
+            self._sequence.enter()
+            self._launch()
+        self._begin_episodes(ended)
+        # A copy, as the next step may give them as terminal observations
+        return self._observations.copy(), rewards, dones, infos
+
+    def close(self) -> None:
+        """End all games. A ``reset()`` begins others."""
+        if self._games is not None:
+            self._games.close()
+        self._games = None
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """
+        :return: The observations, without a render mode ``None`` for each
+        """
+        if self.render_mode != "rgb_array":
+            warnings.warn(f"Images need render_mode='rgb_array', the render mode is {self.render_mode!r}")
+            return [None] * self.num_envs
+        return list(self._observations)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        :param attr_name: An attribute of :class:`~sb3_cchain.envs.ContinualProcgen`
+        :param indices: Of the instances; all have the same
+        :return: Its value, once for each
+        """
+        value = getattr(self._sequence, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        :param attr_name: Any
+        :param value: Any
+        :param indices: Any
+        :raises NotImplementedError: Always, as the instances have no attributes of their own
+        """
+        raise NotImplementedError(f"The attribute `{attr_name}` cannot be set: procgen runs the instances as one")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        :param method_name: ``"set_clock"`` or ``"set_task"``, see :class:`~sb3_cchain.ContinualEnv`
+        :param method_args: Its arguments
+        :param indices: Of the instances; it is called once for all
+        :param method_kwargs: Its keyword arguments
+        :return: What it returns, once for each
+        :raises AttributeError: For any other method
+        """
+        if method_name not in ("set_clock", "set_task"):
+            raise AttributeError(
+                f"The method must be 'set_clock' or 'set_task', as procgen runs the instances as one, got {method_name!r}"
+            )
+        value = getattr(self._sequence, method_name)(*method_args, **method_kwargs)
+        return [value for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        :param wrapper_class: Any
+        :param indices: Of the instances
+        :return: ``False`` for each
+        """
+        return [False for _ in self._get_indices(indices)]
+
+
+def _check_game(game: str, distribution_mode: str) -> None:
+    if game not in GAMES:
+        raise ValueError(f"`game` must be one of {', '.join(GAMES)}, got {game!r}")
+    if distribution_mode == "exploration":
+        raise ValueError(
+            "`distribution_mode` must not be 'exploration', which is the mode 'hard' on one certain level: "
+            "give that level's number with the mode 'hard'"
+        )
+    modes = [mode for mode, games in DISTRIBUTION_MODES.items() if game in games]
+    if distribution_mode not in modes:
+        raise ValueError(f"`distribution_mode` must be one of {', '.join(modes)} for {game}, got {distribution_mode!r}")
+
+
+def _import_procgen() -> "type[ProcgenGym3Env]":
+    try:
+        from procgen import ProcgenGym3Env
+    except ImportError as error:
+        advice = 'procgen is not installed: pip install "sb3-cchain[procgen]"'
+        if sys.version_info >= (3, 13):
+            advice += ". There is no wheel of it for Python 3.13 or later: use Python 3.10, 3.11 or 3.12"
+        raise ImportError(advice) from error
+    return ProcgenGym3Env

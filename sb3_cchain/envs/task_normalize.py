@@ -1,0 +1,145 @@
+"""Normalisation that begins anew with each task."""
+
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
+
+Observation = NDArray | dict[str, NDArray]
+
+
+class TaskVecNormalize(VecNormalize):
+    """
+    Stable-Baselines3's ``VecNormalize``, whose statistics restart when the task of a continual environment changes.
+
+    Nothing is carried over a switch: neither the mean and variance of the observations nor the variance of the returns nor
+    the discounted returns so far. What belongs to the task before is normalised with its statistics: the last step's reward
+    and the ``terminal_observation`` in its info. The observation that comes with that step is already the next task's
+    first, and the first in the new statistics.
+
+    It reads the task from ``task_id`` in the infos, that of the first environment for all; they switch together. Where there
+    is none, where the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With ``training=False``
+    statistics are neither updated nor restarted, so that an evaluation environment has those of training
+    (``EvalCallback`` copies them).
+
+    Saved statistics belong to a task. When training is resumed with them they go on if the environment is put on that task
+    (``CChainPPO`` and :class:`~sb3_cchain.TaskSync` do so) and restart if it is not.
+
+    :param venv: The vectorised environment
+    :param training: See ``VecNormalize``, as the following ones
+    :param norm_obs: Whether to normalise observations
+    :param norm_reward: Whether to normalise rewards
+    :param clip_obs: Greatest absolute value of a normalised observation
+    :param clip_reward: Greatest absolute value of a normalised reward
+    :param gamma: Discount factor of the returns whose variance scales the rewards
+    :param epsilon: Added to variances
+    :param norm_obs_keys: The parts of a ``Dict`` observation to normalise
+    :param restart: Whether the statistics restart at a switch
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        training: bool = True,
+        norm_obs: bool = True,
+        norm_reward: bool = True,
+        clip_obs: float = 10.0,
+        clip_reward: float = 10.0,
+        gamma: float = 0.99,
+        epsilon: float = 1e-8,
+        norm_obs_keys: list[str] | None = None,
+        *,
+        restart: bool = True,
+    ):
+        super().__init__(venv, training, norm_obs, norm_reward, clip_obs, clip_reward, gamma, epsilon, norm_obs_keys)
+        self.restart = restart
+        # The task that the statistics are of; None before the first step, and for other environments always
+        self._statistics_task: int | None = None
+        self._before_reset: dict[str, Any] | None = None
+
+    def reset(self) -> Observation:
+        """
+        Reset all environments.
+
+        :return: Normalised observation
+        """
+        if self._follows_tasks():
+            # Training that is resumed begins with a reset into the first task and another into the task that is due. A
+            # reset that no step followed must leave nothing behind, or loaded statistics would be lost.
+            if self._before_reset is not None:
+                self.__dict__.update(self._before_reset)
+            # Without normalisation of observations there is no `obs_rms`
+            names = {"obs_rms", "ret_rms", "_statistics_task"}.intersection(self.__dict__)
+            self._before_reset = {name: deepcopy(self.__dict__[name]) for name in names}
+        observation = super().reset()
+        if self._enters_task():
+            self._restart()
+            self._update_obs(self.old_obs)
+            observation = self.normalize_obs(self.old_obs)
+        return observation
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :return: Normalised observations and rewards, dones, infos
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self._before_reset = None
+        self.old_obs, self.old_reward = obs, rewards  # type: ignore[assignment]
+        if self.training:
+            self._update_reward(rewards)
+        rewards = self.normalize_reward(rewards)
+        # At a switch the restart comes between what ends and what begins, hence not by VecNormalize's own method
+        switch = self._enters_task()
+        if switch:
+            self._normalize_terminal(dones, infos)
+            self._restart()
+        if self.training:
+            self._update_obs(self.old_obs)
+        observations = self.normalize_obs(self.old_obs)
+        if not switch:
+            self._normalize_terminal(dones, infos)
+        self.returns[dones] = 0
+        return observations, rewards, dones, infos
+
+    def _follows_tasks(self) -> bool:
+        return self.training and self.restart
+
+    def _enters_task(self) -> bool:
+        if not self._follows_tasks():
+            return False
+        # Of the present episode: a vectorised environment resets by itself, and the info of the step is the old episode's
+        task = self.venv.unwrapped.reset_infos[0].get("task_id")
+        previous, self._statistics_task = self._statistics_task, task
+        return previous is not None and previous != task
+
+    def _restart(self) -> None:
+        if self.norm_obs:
+            rms: Any = self.obs_rms
+            if isinstance(rms, dict):
+                self.obs_rms = {key: _fresh(part) for key, part in rms.items()}
+            else:
+                self.obs_rms = _fresh(rms)  # type: ignore[assignment]
+        self.ret_rms = _fresh(self.ret_rms)
+
+    def _update_obs(self, observation: Observation) -> None:
+        if not self.norm_obs:
+            return
+        if isinstance(observation, dict):
+            for key, rms in self.obs_rms.items():
+                rms.update(observation[key])
+        else:
+            self.obs_rms.update(observation)
+
+    def _normalize_terminal(self, dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> None:
+        for position in np.flatnonzero(dones):
+            info = infos[position]
+            if "terminal_observation" in info:
+                info["terminal_observation"] = self.normalize_obs(info["terminal_observation"])
+
+
+def _fresh(rms: RunningMeanStd) -> RunningMeanStd:
+    return RunningMeanStd(shape=rms.mean.shape)
