@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 try:
     import optuna
     import rl_zoo3.cli
+    import rl_zoo3.exp_manager
     from rl_zoo3 import ALGOS
     from rl_zoo3.hyperparams_opt import (
         HYPERPARAMS_CONVERTER,
@@ -27,6 +28,7 @@ except ImportError as error:
     raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.envs import TaskVecNormalize
 
 OUR_ALGOS: dict[str, type[BaseAlgorithm]] = {"ppo_cchain": CChainPPO, "dqn_cchain": CChainDQN, "double_dqn": DoubleDQN}
 
@@ -106,7 +108,11 @@ def convert_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 
 def register_algorithms() -> None:
-    """Make our algorithms known to RL Zoo, in place."""
+    """
+    Make our algorithms known to RL Zoo, in place, and let ``normalize: ...`` in a YAML file restart at each task
+    (``restart=False`` in it does not). Where there are no tasks it is SB3's ``VecNormalize``.
+    """
+    rl_zoo3.exp_manager.VecNormalize = TaskVecNormalize  # type: ignore[misc]
     ALGOS.update(OUR_ALGOS)
     HYPERPARAMS_SAMPLER["ppo_cchain"] = sample_ppo_cchain_params
     HYPERPARAMS_CONVERTER["ppo_cchain"] = convert_onpolicy_params

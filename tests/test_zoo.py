@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -17,9 +18,11 @@ from stable_baselines3 import DQN, PPO
 import sb3_cchain.zoo as zoo
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
+from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
 ROOT = Path(__file__).parent.parent
+DMC = ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"]
 GYM_CONTROL = ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"]
 SHORT = ["--env-kwargs", "steps_per_task:1600", "--eval-freq", "800", "--num-threads", "1", "--device", "cpu", "--seed", "1"]
 
@@ -213,6 +216,29 @@ def test_stock_rl_zoo_trains_dqn_on_minatar(tmp_path):
     assert model._n_updates == 79 + 79 + 80
 
 
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="dm_control has no wheels")
+def test_train_on_walker_with_normalisation_that_restarts(tmp_path):
+    run(
+        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-n", "4096", "-f", "logs"),
+        *("-tb", "tb", "--env-kwargs", "steps_per_task:3000", "--eval-freq", "2048", "--eval-episodes", "1"),
+        *("--num-threads", "1", "--device", "cpu", "--seed", "1", "-params", "n_epochs:1"),
+        cwd=tmp_path,
+    )
+    folder = tmp_path / "logs" / "ppo_cchain" / "Continual-Walker-v0_1"
+    with open(folder / "Continual-Walker-v0" / "vecnormalize.pkl", "rb") as file:
+        statistics = pickle.load(file)
+    assert type(statistics) is TaskVecNormalize
+    # Of the second task alone: 1096 steps and the observation they begin with; RunningMeanStd begins with a count of 1e-4
+    assert statistics.obs_rms.count == pytest.approx(1097, abs=1e-3)
+    model = CChainPPO.load(folder / "Continual-Walker-v0.zip", device="cpu")
+    assert (model.n_steps, model.batch_size, model.churn_reducer.coefficient.initial) == (2048, 64, 100)
+    assert model.churn_reducer.coefficient.target_ratio == 0.5
+    assert [type(layer) for layer in model.policy.mlp_extractor.policy_net] == [th.nn.Linear, th.nn.ReLU] * 2
+    arguments = ("enjoy", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-f", "logs", "-n", "1001", "--no-render")
+    output = run("sb3_cchain.zoo", *arguments, "--device", "cpu", "--env-kwargs", "first_task:1", cwd=tmp_path)
+    assert "Loading running average" in output and re.search(r"^Mean reward: ", output, flags=re.MULTILINE)
+
+
 @pytest.mark.parametrize("arguments", [[], ["fly"]])
 def test_usage(monkeypatch, arguments):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
@@ -236,13 +262,22 @@ def settings_of(algo):
 def test_every_environment_has_settings():
     continual = {f"Continual/{name}" for name in CONTINUAL_ENVS}
     for algos, env_ids in (
-        (("ppo", "ppo_cchain"), continual - {"Continual/MinAtar-v0"}),
+        (("ppo", "ppo_cchain"), {*GYM_CONTROL, *DMC}),
         (("dqn", "double_dqn", "dqn_cchain"), {"Continual/MinAtar-v0"}),
     ):
         for algo in algos:
-            assert set(settings_of(algo)) - {"default", "gym-control-defaults"} == env_ids
+            assert set(settings_of(algo)) - {"default", "gym-control-defaults", "dmc-defaults"} == env_ids <= continual
     for algo in zoo.OUR_ALGOS:
         assert "default" in settings_of(algo)
+
+
+def test_dmc_settings_differ_in_the_churn_arguments_alone():
+    ppo, cchain = (settings_of(algo) for algo in ("ppo", "ppo_cchain"))
+    for env_id in DMC:
+        churn = {key: value for key, value in cchain[env_id].items() if "churn" in key}
+        assert cchain[env_id] == {**ppo[env_id], **churn}
+        assert churn["target_churn_ratio"] == (0.5 if "Walker" in env_id else 0.05)
+        assert ppo[env_id]["n_timesteps"] == (4e6 if "Dog" in env_id else 3e6)
 
 
 def test_dqn_settings_differ_where_the_algorithms_do():

@@ -110,7 +110,7 @@ class TaskSync(BaseCallback):
 
 
 def _check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:
-    for name in ("n_tasks", "games", "offsets"):
+    for name in ("n_tasks", "offsets", "games", "game", "levels", "domain", "task_names"):
         if env.has_attr(name) and eval_env.has_attr(name):
             ours, theirs = env.get_attr(name)[0], eval_env.get_attr(name)[0]
             if not np.array_equal(ours, theirs):
