@@ -37,3 +37,19 @@ def check_number(
     elif math.isfinite(minimum):
         expected += f" greater than {minimum:g}" if exclusive else f" greater than or equal to {minimum:g}"
     raise ValueError(f"`{name}` must be {expected}, got {value!r}")
+
+
+def check_list(name: str, value: Any, of: str) -> list[Any]:
+    """
+    :param name: The argument's name
+    :param value: Its value
+    :param of: What it should be a list of
+    :return: Its elements
+    :raises TypeError: When it is a string, or cannot be iterated over
+    """
+    if isinstance(value, str):
+        raise TypeError(f"`{name}` must be a list of {of}, got the string {value!r}")
+    try:
+        return list(value)
+    except TypeError:
+        raise TypeError(f"`{name}` must be a list of {of}, got {value!r}") from None

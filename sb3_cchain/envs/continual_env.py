@@ -8,7 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType, RenderFrame
 
-from sb3_cchain.validation import check_number
+from sb3_cchain.validation import check_list, check_number
 
 Task = str | Callable[..., gym.Env]
 
@@ -160,9 +160,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
 
 
 def _check_tasks(tasks: Sequence[Task]) -> list[Task]:
-    if isinstance(tasks, str):
-        raise TypeError(f"`tasks` must be a list of environment ids or callables, got the string {tasks!r}")
-    tasks = list(tasks)
+    tasks = check_list("tasks", tasks, of="environment ids or callables")
     if not tasks:
         raise ValueError("`tasks` must name at least one task, got an empty list")
     for position, task in enumerate(tasks):

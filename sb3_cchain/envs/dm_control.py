@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.validation import check_list
 
 
 class FlatDMControl(gym.Wrapper):
@@ -114,12 +115,7 @@ def _known_tasks() -> dict[str, Sequence[str]]:
 
 
 def _check_task_names(domain: str, tasks: Sequence[str]) -> list[str]:
-    if isinstance(tasks, str):
-        raise TypeError(f"`tasks` must be a list of tasks, got the string {tasks!r}")
-    try:
-        tasks = list(tasks)
-    except TypeError:
-        raise TypeError(f"`tasks` must be a list of tasks, got {tasks!r}") from None
+    tasks = check_list("tasks", tasks, of="tasks")
     known = _known_tasks()
     if domain not in list(known):
         raise ValueError(f"Unknown `domain` {domain!r}; it must be one of {', '.join(known)}")

@@ -12,7 +12,7 @@ from gymnasium.wrappers import TransformReward
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
-from sb3_cchain.validation import check_number
+from sb3_cchain.validation import check_list, check_number
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 
@@ -176,12 +176,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
 
 
 def _check_games(games: Sequence[str]) -> list[str]:
-    if isinstance(games, str):
-        raise TypeError(f"`games` must be a list of games, got the string {games!r}")
-    try:
-        games = list(games)
-    except TypeError:
-        raise TypeError(f"`games` must be a list of games, got {games!r}") from None
+    games = check_list("games", games, of="games")
     for game in games:
         if game not in GAMES:
             raise ValueError(f"Unknown game {game!r} in `games`; it must be one of {', '.join(GAMES)}")
