@@ -2,7 +2,15 @@
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
+from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 from sb3_cchain.callbacks.task_learning_starts import TaskLearningStarts
 from sb3_cchain.callbacks.task_sync import TaskSync
 
-__all__ = ["ContinualMetrics", "EpisodicRollouts", "TaskLearningStarts", "TaskSync", "read_returns"]
+__all__ = [
+    "ContinualMetrics",
+    "EpisodicRollouts",
+    "RolloutNormalizedAdvantage",
+    "TaskLearningStarts",
+    "TaskSync",
+    "read_returns",
+]

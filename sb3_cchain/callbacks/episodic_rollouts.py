@@ -1,11 +1,11 @@
 """Rollouts, advantages and value targets as in the paper's PPO."""
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 
 
-class EpisodicRollouts(BaseCallback):
+class EpisodicRollouts(RolloutNormalizedAdvantage):
     """
     Makes SB3's on-policy algorithms learn from rollouts as the PPO does that the paper's Gym Control experiments are made
     with (TRAC's code base):
@@ -17,25 +17,13 @@ class EpisodicRollouts(BaseCallback):
       last observation stands for the rest of an episode that was cut.
     """
 
-    model: OnPolicyAlgorithm
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, OnPolicyAlgorithm):
-            raise TypeError(f"EpisodicRollouts is for on-policy algorithms, got {type(self.model).__name__}")
-        if getattr(self.model, "normalize_advantage", False):
-            raise ValueError("EpisodicRollouts normalises the advantages itself: set `normalize_advantage=False`, got True")
-
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_start(self) -> None:
         self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
         self.model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
 
     def _on_rollout_end(self) -> None:
+        super()._on_rollout_end()
         buffer = self.model.rollout_buffer
-        advantages = buffer.advantages
-        buffer.advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         buffer.returns = discounted_returns(
             buffer.rewards,
             buffer.episode_starts,

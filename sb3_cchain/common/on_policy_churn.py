@@ -77,8 +77,21 @@ class ReferenceBatches:
             yield minibatch
 
 
+# L, by the name in `churn_base_loss`
+BASE_LOSSES = ("actor", "surrogate")
+
+
+def check_base_loss(base_loss: str) -> None:
+    """
+    :param base_loss: The argument ``churn_base_loss``
+    :raises ValueError: When it is none that there is
+    """
+    if base_loss not in BASE_LOSSES:
+        raise ValueError(f"`churn_base_loss` must be one of {', '.join(map(repr, BASE_LOSSES))}, got {base_loss!r}")
+
+
 @contextmanager
-def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
+def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor") -> Iterator[None]:
     """
     Run ``model``'s own ``train()`` in this block to train it with churn reduction.
 
@@ -92,10 +105,11 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
     - ``churn/value_churn``: mean absolute change of the state values by an update, the first of each epoch that another
       follows
 
-    L is the whole actor loss, clipped surrogate and entropy bonus, averaged over the updates.
+    L is averaged over the updates.
 
     :param model: A PPO model
     :param reducer: Its churn reducer
+    :param base_loss: What L is: ``"actor"``, the clipped surrogate and the entropy bonus; ``"surrogate"``, the former alone
     """
     policy, rollout_buffer = model.policy, model.rollout_buffer
     references = ReferenceBatches(rollout_buffer.get)
@@ -126,12 +140,14 @@ def reduced_churn(model: PPO, reducer: ChurnReducer) -> Iterator[None]:
         )
     if reducer.losses:
         logged = model.logger.name_to_value
-        base_loss = abs(logged["train/policy_gradient_loss"] + model.ent_coef * logged["train/entropy_loss"])
+        loss = logged["train/policy_gradient_loss"]
+        if base_loss == "actor":
+            loss += model.ent_coef * logged["train/entropy_loss"]
         churn_loss = np.mean(reducer.losses)
         model.logger.record("churn/loss", churn_loss)
         model.logger.record("churn/coef", coef)
-        model.logger.record("churn/relative_loss", coef * churn_loss / (base_loss + 1e-8))
+        model.logger.record("churn/relative_loss", coef * churn_loss / (abs(loss) + 1e-8))
         model.logger.record("churn/policy_churn", reducer.mean_churn())
         if value_churns:
             model.logger.record("churn/value_churn", np.mean(value_churns))
-        reducer.end_iteration(base_loss)
+        reducer.end_iteration(abs(loss))

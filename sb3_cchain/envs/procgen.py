@@ -20,6 +20,8 @@ from sb3_cchain.validation import check_number
 if TYPE_CHECKING:
     from procgen import ProcgenGym3Env
 
+# Pixels of a frame per pixel of an observation and direction
+FRAME_SCALE = 8
 # Procgen's own names, here so that it need not be installed to know them
 GAMES = (
     "bigfish",
@@ -71,7 +73,8 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
     make the same episode. With ``num_levels=1``, therefore, all episodes begin alike and the seed has no effect. (There is one
     exception: after a reset without a seed Dodgeball's player faces where it last went in the episode before.)
 
-    Frames (``render_mode="rgb_array"``) have 512 × 512 pixels and make a step tens of times slower.
+    Frames (``render_mode="rgb_array"``) are the observations, enlarged. Procgen draws finer ones, but at every step, which is
+    then tens of times slower, and Stable-Baselines3 asks every environment that it makes for frames.
 
     :param game: The game, by procgen's name for it
     :param start_level: The first of its levels
@@ -113,7 +116,7 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         self._game: ProcgenGym3Env | None = None
         # Of the episode that procgen has begun and reset() has not
         self._next_observation: NDArray[np.uint8] | None = None
-        self._frame: NDArray[np.uint8] | None = None
+        self._observation: NDArray[np.uint8] | None = None
 
     def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> "ProcgenGym3Env":
         """
@@ -139,14 +142,12 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
             self.close()
             # Procgen's seeds have 31 bits, Gymnasium's any number
             rand_seed = int(self.np_random.integers(2**31))
-            self._game = self.launch(1, rand_seed, num_threads=0, render_mode=self.render_mode)
+            self._game = self.launch(1, rand_seed, num_threads=0)
             self._next_observation = self._game.observe()[1]["rgb"][0]
         elif self._next_observation is None:
             self._game.act(np.array([NEW_EPISODE]))
             self._next_observation = self._game.observe()[1]["rgb"][0]
-        self._observation: NDArray[np.uint8] = self._next_observation
-        self._next_observation = None
-        self._draw()
+        self._observation, self._next_observation = self._next_observation, None
         return self._observation, {}
 
     def step(self, action: np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
@@ -170,19 +171,15 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
             self._observation = self._observation.copy()  # has been given away before
         else:
             self._observation = observations["rgb"][0]
-            self._draw()
         return self._observation, float(rewards[0]), terminated, False, {}
-
-    def _draw(self) -> None:
-        # At each step, as at an episode's end procgen would draw the next episode
-        if self.render_mode is not None and self._game is not None:
-            self._frame = self._game.get_info()[0]["rgb"]
 
     def render(self) -> NDArray[np.uint8] | None:
         """
-        :return: The frame ``(512, 512, 3)`` of the last observation, ``None`` without a render mode
+        :return: The last observation, enlarged to ``(512, 512, 3)``; ``None`` without a render mode or before a reset
         """
-        return self._frame
+        if self.render_mode is None or self._observation is None:
+            return None
+        return self._observation.repeat(FRAME_SCALE, axis=0).repeat(FRAME_SCALE, axis=1)
 
     def close(self) -> None:
         """End the game. A ``reset()`` begins another."""

@@ -1,13 +1,13 @@
 """PPO with churn reduction."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.common.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.common.on_policy_churn import make_policy_reducer, reduced_churn
+from sb3_cchain.common.on_policy_churn import check_base_loss, make_policy_reducer, reduced_churn
 
 SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
 
@@ -32,18 +32,25 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param args: Further arguments of PPO
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
-        ``target_churn_ratio`` times the actor loss (entropy bonus included), or ``"auto_10"`` to use 10 instead of 1
-        during the warm-up. With 0 it is PPO, to the bit.
-    :param target_churn_ratio: β, the size of λ·L_churn relative to the actor loss. ``"auto"`` is 1e4 for discrete actions
+        ``target_churn_ratio`` times ``churn_base_loss``, or ``"auto_10"`` to use 10 instead of 1 during the warm-up.
+        With 0 it is PPO, to the bit.
+    :param target_churn_ratio: β, the size of λ·L_churn relative to that loss. ``"auto"`` is 1e4 for discrete actions
         (the paper takes the best of 1e3, 1e4 and 1e5) and 0.05 for continuous ones (the paper: 0.05 or 0.5).
     :param churn_warmup: Iterations (rollout and ``train()``) until λ adapts
     :param churn_window: Iterations that the running means of both losses go over
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the released
         code. C-CHAIN does not need to be told of a switch, hence not by default.
+    :param churn_base_loss: ``"actor"``, the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
+        or ``"surrogate"``, the former alone, as in its ProcGen
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range
     """
+
+    def __init__(self, *args: Any, churn_base_loss: str = "actor", **kwargs: Any):
+        check_base_loss(churn_base_loss)
+        self.churn_base_loss = churn_base_loss
+        super().__init__(*args, **kwargs)
 
     def _make_churn_reducer(self) -> ChurnReducer:
         return make_policy_reducer(self, self._make_churn_coefficient)
@@ -53,7 +60,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
         if self.churn_reducer.coefficient.is_zero:
             super().train()
         else:
-            with reduced_churn(self, self.churn_reducer):
+            with reduced_churn(self, self.churn_reducer, self.churn_base_loss):
                 super().train()
 
     def learn(
