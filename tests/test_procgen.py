@@ -186,17 +186,15 @@ def test_seeds_determine_the_levels():
 def test_frames():
     env = ProcgenGame("starpilot", start_level=20, num_levels=1, render_mode="rgb_array")
     assert env.render() is None
-    reference = Reference("starpilot", render_mode="rgb_array")
-    env.reset()
+    observation, _ = env.reset()
     frames = []
     for action in random_actions(60):
         before = env.render()
-        expected = reference.game.get_info()[0]["rgb"]
         assert before.shape == (512, 512, 3) and before.dtype == np.uint8
-        assert np.array_equal(before, expected)
+        for row, column in ((0, 0), (3, 5), (7, 7)):
+            assert np.array_equal(before[row::8, column::8], observation)
         frames.append(before)
-        terminated = env.step(action)[2]
-        reference.step(action)
+        observation, _, terminated, _, _ = env.step(action)
         if terminated:
             assert np.array_equal(env.render(), before)
             env.reset()

@@ -138,12 +138,14 @@ def test_default_ratio_is_that_of_the_action_space():
     assert box.churn_reducer.coefficient.target_ratio == 0.05
 
 
-def test_adaptive_coefficient_holds_the_ratio():
+@pytest.mark.parametrize("churn_base_loss, of_entropy", [("actor", 0.01), ("surrogate", 0.0)])
+def test_adaptive_coefficient_holds_the_ratio(churn_base_loss, of_entropy):
     # A window of one iteration: λ of an iteration is set by the losses of the one before
-    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_warmup=1, churn_window=1, ent_coef=0.01, **SETTINGS)
+    arguments = dict(churn_warmup=1, churn_window=1, churn_base_loss=churn_base_loss)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", ent_coef=0.01, **arguments, **SETTINGS)
     model.learn(5 * 32)
     logged = model.logger.name_to_value
-    base_loss = abs(logged["train/policy_gradient_loss"] + 0.01 * logged["train/entropy_loss"])
+    base_loss = abs(logged["train/policy_gradient_loss"] + of_entropy * logged["train/entropy_loss"])
     assert logged["churn/relative_loss"] == pytest.approx(logged["churn/coef"] * logged["churn/loss"] / base_loss, rel=1e-4)
     coefficient = model.churn_reducer.coefficient
     assert coefficient.base_losses.item() == pytest.approx(base_loss)
@@ -204,6 +206,7 @@ def test_not_a_number_raises_and_leaves_the_parameters_finite():
         ({"churn_warmup": 1.5}, "churn_warmup"),
         ({"churn_window": 0}, "churn_window"),
         ({"churn_coef_min": -1}, "churn_coef_min"),
+        ({"churn_base_loss": "value"}, "churn_base_loss"),
     ],
 )
 @pytest.mark.parametrize("make", [lambda **kw: CChainPPO("MlpPolicy", "no environment is made", **kw), CChainCallback])
@@ -218,7 +221,7 @@ def test_unknown_arguments_are_refused():
 
 
 def test_callback_on_stock_ppo_equals_cchain_ppo():
-    arguments = dict(target_churn_ratio=1e3, churn_warmup=1, churn_window=3)
+    arguments = dict(target_churn_ratio=1e3, churn_warmup=1, churn_window=3, churn_base_loss="surrogate")
     ours = CChainPPO("MlpPolicy", "CartPole-v1", **arguments, **SETTINGS).learn(4 * 32)
     stock = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(4 * 32, callback=CChainCallback(**arguments))
     assert_churn_was_reduced(stock)

@@ -312,45 +312,6 @@ def test_n_step_returns_of_dict_observations_are_refused():
 # --- The feature extractor ------------------------------------------------------------------------------------------------
 
 
-def test_minatar_network_by_hand():
-    extractor = MinAtarCNN(CELLS)
-    # 16 filters of 3×3×4 and a bias; 8×8 places of 16 features to 128 units and a bias
-    assert sum(p.numel() for p in extractor.parameters()) == 16 * (3 * 3 * 4 + 1) + 128 * (8 * 8 * 16 + 1)
-    observation = th.zeros(1, 10, 10, 4)
-    observation[0, 2, 7, 3] = 1
-    with th.no_grad():
-        conv = extractor.cnn[0]
-        expected = conv.bias[5] + conv.weight[5, 3, 2, 1]  # the cell seen by the filter whose corner is at (0, 6)
-        features = extractor.cnn(observation.permute(0, 3, 1, 2))[0]
-        assert th.allclose(features[5, 0, 6], expected.relu())
-        assert th.allclose(features[5, 5, 0], conv.bias[5].relu())
-        assert th.equal(extractor(observation), extractor.linear(features.permute(1, 2, 0).reshape(1, -1)))
-        assert extractor(observation).shape == (1, 128) and extractor(observation).min() >= 0
-
-
-@pytest.mark.parametrize(
-    "space",
-    [BOX, spaces.Box(0, 1, (2, 10, 4)), spaces.Box(0, 255, (1, 9, 2), np.uint8), spaces.MultiBinary((10, 10, 4))],
-    ids=str,
-)
-def test_minatar_network_refuses_other_observations(space):
-    with pytest.raises(ValueError, match="MinAtarCNN needs Box observations"):
-        MinAtarCNN(space)
-
-
-@pytest.mark.parametrize("algorithm", [PPO, DQN, CChainDQN])
-@pytest.mark.parametrize("space", [CELLS, spaces.Box(0, 255, (10, 10, 4), np.uint8)], ids=["bool", "uint8"])
-def test_minatar_network_in_policies(algorithm, space):
-    settings = dict(n_steps=16, batch_size=8) if algorithm is PPO else SETTINGS
-    net_arch = dict(pi=[], vf=[]) if algorithm is PPO else []
-    policy_kwargs = dict(features_extractor_class=MinAtarCNN, net_arch=net_arch)
-    model = algorithm("MlpPolicy", RandomEnv(space), **{**settings, "device": "cpu", "policy_kwargs": policy_kwargs})
-    model.learn(32)
-    extractor = model.policy.features_extractor if algorithm is PPO else model.q_net.features_extractor
-    assert extractor.cnn[0].weight.shape == (16, 4, 3, 3)
-    assert extractor.linear[0].in_features == 16 * 8 * 8
-
-
 def test_observations_stay_small_in_the_replay_buffer():
     env = RandomEnv(spaces.Box(0, 1, (10, 10, 10), np.bool_))
     buffer = learn(env, policy_kwargs=dict(features_extractor_class=MinAtarCNN, net_arch=[])).replay_buffer

@@ -23,6 +23,7 @@ from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
 ROOT = Path(__file__).parent.parent
 DMC = ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"]
+PROCGEN = [f"Continual/{name}" for name, registration in CONTINUAL_ENVS.items() if "game" in registration.get("kwargs", {})]
 GYM_CONTROL = ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"]
 SHORT = ["--env-kwargs", "steps_per_task:1600", "--eval-freq", "800", "--num-threads", "1", "--device", "cpu", "--seed", "1"]
 
@@ -261,23 +262,62 @@ def settings_of(algo):
 
 def test_every_environment_has_settings():
     continual = {f"Continual/{name}" for name in CONTINUAL_ENVS}
+    assert len(continual) == 24 and {*GYM_CONTROL, *PROCGEN, *DMC, "Continual/MinAtar-v0"} == continual
     for algos, env_ids in (
-        (("ppo", "ppo_cchain"), {*GYM_CONTROL, *DMC}),
+        (("ppo", "ppo_cchain"), {*GYM_CONTROL, *PROCGEN, *DMC}),
         (("dqn", "double_dqn", "dqn_cchain"), {"Continual/MinAtar-v0"}),
     ):
         for algo in algos:
-            assert set(settings_of(algo)) - {"default", "gym-control-defaults", "dmc-defaults"} == env_ids <= continual
+            assert {key for key in settings_of(algo) if not key.endswith("default") and "defaults" not in key} == env_ids
     for algo in zoo.OUR_ALGOS:
         assert "default" in settings_of(algo)
 
 
-def test_dmc_settings_differ_in_the_churn_arguments_alone():
+# Shorter than the settings', where a rollout of those takes long
+ROLLOUTS = {
+    **{(algo, env_id): [] for env_id in GYM_CONTROL for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:64", "batch_size:32", "n_epochs:1"] for env_id in PROCGEN for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:256", "n_epochs:1"] for env_id in DMC for algo in ("ppo", "ppo_cchain")},
+    **{(algo, "Continual/MinAtar-v0"): ["buffer_size:1000"] for algo in ("dqn", "double_dqn", "dqn_cchain")},
+}
+
+
+@pytest.mark.parametrize("algo, env_id", ROLLOUTS)
+@pytest.mark.filterwarnings("ignore")
+def test_every_environment_trains_a_rollout_with_its_settings(monkeypatch, tmp_path, algo, env_id):
+    if sys.version_info >= (3, 13) and env_id in PROCGEN + DMC:
+        pytest.skip("no wheels")
+    changed = ROLLOUTS[algo, env_id]
+    n_steps = next((change.split(":")[1] for change in changed if "n_steps" in change), "800")
+    monkeypatch.setattr("sys.argv", [
+        *("sb3-cchain", "train", "--algo", algo, "--env", env_id, "-n", n_steps, "--eval-freq", "-1", "-f", str(tmp_path)),
+        *("--seed", "0", "--num-threads", "1", "--device", "cpu", "--verbose", "0", *(["-params", *changed] if changed else [])),
+    ])  # fmt: skip
+    zoo.main()
+    (path,) = tmp_path.glob(f"{algo}/*/*-v?.zip")
+    algorithm = {"ppo": PPO, "dqn": DQN, **zoo.OUR_ALGOS}[algo]
+    model = algorithm.load(path, device="cpu")
+    settings = settings_of(algo)[env_id]
+    assert model.num_timesteps == int(n_steps) and model.gamma == settings["gamma"]
+    if "dqn" in algo:
+        assert model._n_updates == 0 and model.learning_starts == 10_000  # all of it random
+        return
+    assert model._n_updates == (1 if changed else settings["n_epochs"])
+    if algo == "ppo_cchain":
+        assert model.churn_reducer.coefficient.n_seen == 1
+        assert model.churn_reducer.coefficient.target_ratio == settings["target_churn_ratio"]
+
+
+def test_suites_differ_in_the_churn_arguments_alone():
     ppo, cchain = (settings_of(algo) for algo in ("ppo", "ppo_cchain"))
-    for env_id in DMC:
+    for env_id in PROCGEN + DMC:
         churn = {key: value for key, value in cchain[env_id].items() if "churn" in key}
         assert cchain[env_id] == {**ppo[env_id], **churn}
-        assert churn["target_churn_ratio"] == (0.5 if "Walker" in env_id else 0.05)
+    for env_id in DMC:
+        assert cchain[env_id]["target_churn_ratio"] == (0.5 if "Walker" in env_id else 0.05)
         assert ppo[env_id]["n_timesteps"] == (4e6 if "Dog" in env_id else 3e6)
+    for env_id in PROCGEN:
+        assert cchain[env_id] == cchain["Continual/Starpilot-v0"]
 
 
 def test_dqn_settings_differ_where_the_algorithms_do():

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticCnnPolicy
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -14,7 +15,9 @@ class ImpalaPolicy(ActorCriticCnnPolicy):
     :class:`~sb3_cchain.common.torch_layers.ImpalaCNN`, which keep the initialisation that it gives them (SB3's ``ortho_init``
     would make them orthogonal), and linear heads on them, orthogonal with gain 0.01 for the policy and 1 for the value.
 
-    :param args: Arguments of ``ActorCriticCnnPolicy``
+    :param observation_space: Images; see :class:`~sb3_cchain.common.torch_layers.ImpalaCNN`
+    :param action_space: Action space
+    :param lr_schedule: Learning rate, a function of the share of the training that remains
     :param net_arch: Layers between the features and the heads, by default none
     :param features_extractor_class: :class:`~sb3_cchain.common.torch_layers.ImpalaCNN` or a class derived from it; its
         arguments, as ``dict(layer_norm=True)``, go into ``features_extractor_kwargs``
@@ -24,18 +27,27 @@ class ImpalaPolicy(ActorCriticCnnPolicy):
 
     def __init__(
         self,
-        *args: Any,
+        observation_space: spaces.Box,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        *,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         features_extractor_class: type[ImpalaCNN] = ImpalaCNN,
         **kwargs: Any,
     ):
         if not issubclass(features_extractor_class, ImpalaCNN):
             raise TypeError(f"`features_extractor_class` must be ImpalaCNN or derived from it, got {features_extractor_class}")
-        net_arch = [] if net_arch is None else net_arch
-        super().__init__(*args, net_arch=net_arch, features_extractor_class=features_extractor_class, **kwargs)
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=[] if net_arch is None else net_arch,
+            features_extractor_class=features_extractor_class,
+            **kwargs,
+        )
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        extractors = [self.pi_features_extractor, self.vf_features_extractor]
-        for extractor in extractors[:1] if self.share_features_extractor else extractors:
+        for extractor in dict.fromkeys((self.pi_features_extractor, self.vf_features_extractor)):  # one where they share it
+            assert isinstance(extractor, ImpalaCNN)
             extractor.reset_parameters()

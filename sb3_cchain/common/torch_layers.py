@@ -119,7 +119,7 @@ class ImpalaCNN(_ImageExtractor):
         for module in self.modules():
             if isinstance(module, (nn.Conv2d, nn.Linear)):
                 nn.init.xavier_uniform_(module.weight)
-                nn.init.zeros_(module.bias)
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
             elif isinstance(module, nn.LayerNorm):
                 module.reset_parameters()
 

@@ -116,6 +116,7 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         self._game: ProcgenGym3Env | None = None
         # Of the episode that procgen has begun and reset() has not
         self._next_observation: NDArray[np.uint8] | None = None
+        # The last that was given away
         self._observation: NDArray[np.uint8] | None = None
 
     def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> "ProcgenGym3Env":
@@ -147,8 +148,9 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         elif self._next_observation is None:
             self._game.act(np.array([NEW_EPISODE]))
             self._next_observation = self._game.observe()[1]["rgb"][0]
-        self._observation, self._next_observation = self._next_observation, None
-        return self._observation, {}
+        observation = self._observation = self._next_observation
+        self._next_observation = None
+        return observation, {}
 
     def step(self, action: np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
         """
@@ -159,19 +161,18 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         :raises ValueError: For any other action
         :raises gymnasium.error.ResetNeeded: Before the first ``reset()`` and after the end of an episode
         """
-        if self._game is None or self._next_observation is not None:
+        if self._game is None or self._observation is None or self._next_observation is not None:
             raise gym.error.ResetNeeded("Call reset() before step()")
         if not 0 <= action < N_ACTIONS:
             raise ValueError(f"An action must be an integer between 0 and {N_ACTIONS - 1}, got {action!r}")
         self._game.act(np.array([action]))
         rewards, observations, ended = self._game.observe()
-        terminated = bool(ended[0])
+        observation, terminated = observations["rgb"][0], bool(ended[0])
         if terminated:
-            self._next_observation = observations["rgb"][0]
-            self._observation = self._observation.copy()  # has been given away before
-        else:
-            self._observation = observations["rgb"][0]
-        return self._observation, float(rewards[0]), terminated, False, {}
+            self._next_observation = observation
+            observation = self._observation.copy()
+        self._observation = observation
+        return observation, float(rewards[0]), terminated, False, {}
 
     def render(self) -> NDArray[np.uint8] | None:
         """
