@@ -289,10 +289,9 @@ def test_every_environment_trains_a_rollout_with_its_settings(monkeypatch, tmp_p
         pytest.skip("no wheels")
     changed = ROLLOUTS[algo, env_id]
     n_steps = next((change.split(":")[1] for change in changed if "n_steps" in change), "800")
-    monkeypatch.setattr("sys.argv", [
-        *("sb3-cchain", "train", "--algo", algo, "--env", env_id, "-n", n_steps, "--eval-freq", "-1", "-f", str(tmp_path)),
-        *("--seed", "0", "--num-threads", "1", "--device", "cpu", "--verbose", "0", *(["-params", *changed] if changed else [])),
-    ])  # fmt: skip
+    arguments = ["train", "--algo", algo, "--env", env_id, "-n", n_steps, "--eval-freq", "-1", "-f", str(tmp_path)]
+    arguments += ["--seed", "0", "--num-threads", "1", "--device", "cpu", "--verbose", "0"]
+    monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments, *(["-params", *changed] if changed else [])])
     zoo.main()
     (path,) = tmp_path.glob(f"{algo}/*/*-v?.zip")
     algorithm = {"ppo": PPO, "dqn": DQN, **zoo.OUR_ALGOS}[algo]
