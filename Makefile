@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV = .venv
 BIN = $(VENV)/bin
 SOURCES = sb3_cchain benchmarks tests
+SUITE = gym_control
 # Extras that the demo, the tests and the benchmarks need
 EXTRAS = dev
 
@@ -11,7 +12,7 @@ EXTRAS = dev
 # --- The two commands of the README -------------------------------------------------------------------------------------
 
 demo: install
-	$(BIN)/python -m benchmarks.demo $(ARGS)
+	$(BIN)/python -m benchmarks.demo --suite $(SUITE) $(ARGS)
 
 test: lint check-codestyle type pytest
 

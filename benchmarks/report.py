@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.runs import Run
+from benchmarks.suites import Suite, Task
 from sb3_cchain.callbacks.continual_metrics import task_averages
 
 LABELS = {"ppo": "PPO", "ppo_cchain": "C-CHAIN PPO", "double_dqn": "Double DQN", "dqn_cchain": "C-CHAIN DQN"}
@@ -64,6 +65,18 @@ def markdown_table(runs: Sequence[Run], returns: Returns = Run.returns, random_r
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def cost_table(runs: Sequence[Run]) -> str:
+    """
+    :param runs: Finished runs
+    :return: A row per run: environment steps per second, and peak memory
+    """
+    lines = [["algorithm", "seed", "steps per second", "peak memory"], ["---"] * 4]
+    for run in runs:
+        steps_per_second, memory = run.cost
+        lines.append([LABELS[run.algo], str(run.seed), f"{steps_per_second:.0f}", f"{memory:.1f} GB"])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def smoothed(values: np.ndarray, window: int) -> np.ndarray:
     """
     :param values: A series
@@ -85,6 +98,7 @@ def plot_curves(
     task_names: Sequence[str] | None = None,
     random_returns: Sequence[float] | None = None,
     own_scales: bool = False,
+    frames: Sequence[np.ndarray] = (),
 ) -> None:
     """
     Draw the return of each rollout (or evaluation) against environment steps, a thin line per run, a thick one for the mean
@@ -98,22 +112,30 @@ def plot_curves(
     :param task_names: Names of the tasks, by default their numbers
     :param random_returns: A random policy's return on each task, drawn as a dotted line
     :param own_scales: Whether each task has a panel with a scale of its own, where tasks differ in the size of their returns
+    :param frames: A picture of each task, drawn above the curves
     """
     plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
     n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
     task_names = task_names or [f"task {task}" for task in range(n_tasks)]
+    frames_height = 8 / n_tasks * max((frame.shape[0] / frame.shape[1] for frame in frames), default=0)
+    figure = plt.figure(figsize=(9, 4.2 + frames_height), layout="constrained")
+    grid = figure.add_gridspec(2 if len(frames) else 1, n_tasks, height_ratios=[frames_height, 3.8] if len(frames) else [1])
+    for task, frame in enumerate(frames):
+        picture = figure.add_subplot(grid[0, task])
+        picture.imshow(frame)
+        picture.axis("off")
     if own_scales:
-        figure, panels = plt.subplots(1, n_tasks, figsize=(9, 4.2), layout="constrained")
+        panels = [figure.add_subplot(grid[-1, task]) for task in range(n_tasks)]
     else:
-        figure, panel = plt.subplots(figsize=(9, 4.2), layout="constrained")
-        panels = [panel] * n_tasks
+        panels = [figure.add_subplot(grid[-1, :])] * n_tasks
+    axes: Any
     for task, axes in enumerate(panels):
         start, end = task * steps_per_task, (task + 1) * steps_per_task
         for algo in LABELS:
             _draw(axes, [run for run in runs if run.algo == algo], task, returns, window)
         if random_returns is not None:
             axes.hlines(random_returns[task], start, end, color="0.35", linestyle=":", label="random policy")
-        at_middle = dict(ha="center", va="bottom", transform=axes.get_xaxis_transform(), color="0.35")
+        at_middle: dict[str, Any] = dict(ha="center", va="bottom", transform=axes.get_xaxis_transform(), color="0.35")
         axes.text((start + end) / 2, 1.01, task_names[task], **at_middle)
         if task > 0 and not own_scales:
             axes.axvline(start, color="0.35", linestyle="--", linewidth=1)
@@ -149,26 +171,40 @@ def _draw(axes: Any, runs: Sequence[Run], task: int, returns: Returns, window: i
     axes.plot(grid, mean, color=color, linewidth=2.2, label=label)
 
 
-def report(
-    runs: Sequence[Run],
-    folder: Path,
-    title: str,
-    returns: Returns = Run.returns,
-    random_returns: Sequence[float] | None = None,
-    **options: Any,
-) -> None:
+def report(suite: Suite, runs: Sequence[Run], folder: Path, tasks: Sequence[Task]) -> None:
     """
-    Write ``table.md`` and ``curves.png``, and print the table.
+    Write ``table.md`` and ``curves.png``, and print the tables.
 
+    :param suite: Suite of the runs
     :param runs: Finished runs of one environment and length
     :param folder: Where they go
-    :param title: Title of the picture
-    :param returns: Which returns
-    :param random_returns: A random policy's return on each task
-    :param options: Further keyword arguments of :func:`plot_curves`
+    :param tasks: The tasks of the runs
     """
     runs = sorted(runs, key=lambda run: (list(LABELS).index(run.algo), run.seed))
-    table = markdown_table(runs, returns, random_returns)
-    (folder / "table.md").write_text(table + "\n")
-    plot_curves(runs, folder / "curves.png", title, returns, random_returns=random_returns, **options)
-    print(f"{table}\n\nWritten: {folder}/table.md, {folder}/curves.png")
+    tables = f"{markdown_table(runs, suite.returns, [task.random_return for task in tasks])}\n\n{cost_table(runs)}"
+    (folder / "table.md").write_text(tables + "\n")
+    plot_suite(suite, runs, folder / "curves.png", runs[0].env_id, tasks)
+    print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")
+
+
+def plot_suite(suite: Suite, runs: Sequence[Run], path: Path, title: str, tasks: Sequence[Task]) -> None:
+    """
+    The learning curves as the suite wants them.
+
+    :param suite: Suite of the runs
+    :param runs: Finished runs of one environment and length
+    :param path: PNG file
+    :param title: Title
+    :param tasks: The tasks of the runs
+    """
+    plot_curves(
+        runs,
+        path,
+        title,
+        suite.returns,
+        window=1 if suite.evaluates else 5,
+        task_names=[task.name for task in tasks],
+        random_returns=[task.random_return for task in tasks],
+        own_scales=suite.own_scales,
+        frames=[task.frame for task in tasks if task.frame is not None],
+    )

@@ -1,7 +1,9 @@
 """Training runs as processes: each is the command that a user would type, and is never repeated once it is done."""
 
 import json
+import math
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -99,6 +101,12 @@ class Run:
             command = [sys.executable, "-m", "sb3_cchain.zoo", *self.arguments]
             return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
+    @property
+    def cost(self) -> tuple[float, float]:
+        """Environment steps per second, start included, and peak memory in GB (NaN where the system does not tell it)."""
+        done = json.loads((self.folder / DONE).read_text())
+        return self.total_steps / done["seconds"], (done.get("peak_memory") or math.nan) / 1e9
+
     def returns(self) -> list[dict[str, float]]:
         """
         :return: Rows of the run's CSV file so far
@@ -125,6 +133,13 @@ class Run:
         ]
 
 
+def _peak_memory(pid: int) -> int | None:
+    """Bytes that a process has had resident at most, where Linux tells it of one that is running."""
+    status = Path(f"/proc/{pid}/status")
+    found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
+    return 1024 * int(found[1]) if found else None
+
+
 def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
     """
     Bring all runs to their end, with a progress bar each. Runs that are done are left as they are, so that the same call
@@ -143,6 +158,7 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
     )
     waiting = [run for run in runs if not run.is_done]
     running: dict[Run, tuple[subprocess.Popen, float]] = {}
+    peak_memory: dict[Run, int | None] = {}
     with Progress(*columns, refresh_per_second=2) as progress:
         bars = {run: progress.add_task(run.name, total=run.total_steps, start=False, status="") for run in runs}
         for run in runs:
@@ -159,15 +175,15 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
                     if rows := run.returns():
                         status = f"task {rows[-1]['task_id']:g}, return {rows[-1]['mean_return']:.0f}"
                         progress.update(bars[run], completed=rows[-1]["timesteps"], status=status)
+                    peak_memory[run] = _peak_memory(process.pid) or peak_memory.get(run)
                     if process.poll() is None:
                         continue
                     del running[run]
                     if process.returncode != 0:
                         raise RuntimeError(f"{run.name} failed with exit code {process.returncode}, see {run.folder}/log.txt")
                     progress.update(bars[run], completed=run.total_steps)
-                    (run.folder / DONE).write_text(
-                        json.dumps({"seconds": round(time.time() - start), "settings": run.settings}, indent=1)
-                    )
+                    done = {"seconds": round(time.time() - start), "peak_memory": peak_memory[run], "settings": run.settings}
+                    (run.folder / DONE).write_text(json.dumps(done, indent=1))
         finally:
             for process, _ in running.values():
                 process.terminate()

@@ -1,14 +1,16 @@
 """The benchmarks' own machinery."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
-from benchmarks.minatar import random_return
-from benchmarks.report import averages_of, markdown_table, plot_curves, smoothed
+from benchmarks.report import averages_of, cost_table, markdown_table, plot_curves, report, smoothed
 from benchmarks.runs import DONE, Run, complete
+from benchmarks.suites import ALL_ENVS, SUITES, Task, look_at
 
+FRAME = np.zeros((20, 30, 3), np.uint8)
 CSV = "timesteps,task_id,n_episodes,mean_return\n"
 
 
@@ -56,9 +58,46 @@ def test_evaluations_by_task(tmp_path):
     assert markdown_table([run], Run.evaluations).splitlines()[2] == "| PPO | 0 | 3.5 | 4.0 | 3.8 |"
 
 
-def test_random_policy_on_a_game():
+def test_suites_cover_the_environments():
+    assert sorted(env_id for suite in SUITES.values() for env_id in suite.env_ids) == sorted(ALL_ENVS)
+    assert {name: len(suite.env_ids) for name, suite in SUITES.items()} == dict(gym_control=4, procgen=16, dmc=3, minatar=1)
+    assert SUITES["gym_control"].length("Continual/MountainCar-v0") == (5, 320_000)
+    assert SUITES["minatar"].length("Continual/MinAtar-v0") == (3, 1_500_000)
+
+
+def test_a_task_without_an_agent(tmp_path):
+    suite = SUITES["minatar"]
+    task = look_at(suite, suite.run("dqn_cchain", "Continual/MinAtar-v0", 0, 3, 100, tmp_path), 1, n_episodes=300, draw=True)
+    assert task.name == "Asterix" and task.frame.shape == (160, 160, 3)
     # Measured with MinAtar alone over 9000 episodes: 0.51 ± 0.01
-    assert 0.35 < random_return("Asterix", n_episodes=300) < 0.75
+    assert 0.35 < task.random_return < 0.75
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
+def test_names_of_tasks(tmp_path):
+    for name, env_id, expected in (
+        ("procgen", "Continual/Maze-v0", "level 21"),
+        ("dmc", "Continual/Walker-v0", "walk"),
+        ("gym_control", "Continual/CartPole-v1", "task 1"),
+    ):
+        suite = SUITES[name]
+        task = look_at(suite, suite.run("ppo", env_id, 0, 2, 100, tmp_path), 1, n_episodes=1)
+        assert task.name == expected and task.frame is None
+
+
+def test_report(tmp_path):
+    runs = [make_run(tmp_path, algo) for algo in ("ppo_cchain", "ppo")]
+    for run, memory in zip(runs, (2_500_000_000, None), strict=True):
+        (run.folder / DONE).write_text(json.dumps({"seconds": 16, "peak_memory": memory, "settings": {}}))
+    assert cost_table(runs).splitlines()[2:] == ["| C-CHAIN PPO | 0 | 200 | 2.5 GB |", "| PPO | 0 | 200 | nan GB |"]
+    tasks = [Task("one", -300.0, FRAME), Task("two", -1.0, FRAME)]
+    report(SUITES["gym_control"], runs, tmp_path, tasks)
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert [line.split(" | ")[0].strip("| *") for line in lines if line] == [
+        *("algorithm", "---", "PPO", "C-CHAIN PPO", "PPO", "C-CHAIN PPO", "random policy"),
+        *("algorithm", "---", "PPO", "C-CHAIN PPO"),
+    ]
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_smoothed_by_hand():
@@ -67,7 +106,11 @@ def test_smoothed_by_hand():
 
 def test_plot(tmp_path):
     runs = [make_run(tmp_path), make_run(tmp_path, "ppo_cchain")]
-    for some, options in ((runs, {}), (runs[:1], {}), (runs, dict(own_scales=True, random_returns=[-60.0, -70.0]))):
+    for some, options in (
+        (runs, {}),
+        (runs[:1], {}),
+        (runs, dict(own_scales=True, random_returns=[-60.0, -70.0], frames=[FRAME] * 2)),
+    ):
         plot_curves(some, tmp_path / "new" / "curves.png", "title", **options)
         assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
         (tmp_path / "new" / "curves.png").unlink()
@@ -79,6 +122,8 @@ def test_runs_are_completed_and_not_repeated(tmp_path):
     assert run.is_done and [row["timesteps"] for row in run.returns()] == [800, 1600]
     written = (run.folder / DONE).stat().st_mtime_ns
     assert json.loads((run.folder / DONE).read_text())["seconds"] > 0
+    if sys.platform == "linux":
+        assert 1e8 < json.loads((run.folder / DONE).read_text())["peak_memory"] < 1e10
     complete([run], n_jobs=1)
     assert (run.folder / DONE).stat().st_mtime_ns == written
     # Made with other settings, it does not count as done

@@ -153,9 +153,7 @@ def test_impala_policy_trains_and_loads(tmp_path, algorithm):
     for policy in (loaded.policy, ImpalaPolicy.load(tmp_path / "policy", device="cpu")):
         for name, parameter in model.policy.named_parameters():
             assert th.equal(parameter, policy.get_parameter(name)), name
-        assert np.array_equal(
-            policy.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
-        )
+        assert np.array_equal(policy.predict(observation, deterministic=True)[0], action)
     loaded.learn(32)
 
 

@@ -1,0 +1,155 @@
+"""The suites of the paper: their environments, the algorithms that are compared in them, and what their tasks are."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from benchmarks.runs import Run
+from sb3_cchain import ContinualEnv
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+
+ALL_ENVS = [f"Continual/{name}" for name in CONTINUAL_ENVS]
+
+
+@dataclass(frozen=True)
+class Suite:
+    """
+    One suite.
+
+    :param env_ids: Its environments
+    :param task_name: What a task of an environment is called, by its number
+    :param algos: Vanilla and C-CHAIN, by their names on the command line
+    :param evaluates: Whether what counts is the return of greedy evaluations, not of training
+    :param env_kwargs: Arguments of the environment, as on the command line, for a number of tasks and a seed
+    :param own_scales: Whether tasks differ in the size of their returns
+    """
+
+    env_ids: list[str]
+    task_name: Callable[[Any, int], str]
+    algos: tuple[str, str] = ("ppo", "ppo_cchain")
+    evaluates: bool = False
+    env_kwargs: Callable[[int, int], tuple[str, ...]] = lambda n_tasks, seed: ()
+    own_scales: bool = False
+
+    @property
+    def returns(self) -> Callable[[Run], list[dict[str, float]]]:
+        """The returns that count, of a run."""
+        return Run.evaluations if self.evaluates else Run.returns
+
+    def length(self, env_id: str) -> tuple[int, int]:
+        """
+        :param env_id: One of ``env_ids``
+        :return: The paper's number of tasks, and environment steps per task
+        """
+        env: Any = gym.make(env_id).unwrapped
+        return env.n_tasks, env.steps_per_task[0]
+
+    def run(
+        self, algo: str, env_id: str, seed: int, n_tasks: int, steps_per_task: int, folder: Path, eval_freq: int | None = None
+    ) -> Run:
+        """
+        :param algo: One of ``algos``
+        :param env_id: One of ``env_ids``
+        :param seed: Seed of the agent; and of the offsets in Gym Control, where the algorithms meet the same tasks under the
+            same seed
+        :param n_tasks: Length of the task sequence
+        :param steps_per_task: Environment steps per task
+        :param folder: Parent of the run's folder
+        :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the
+            paper
+        :return: The run
+        """
+        eval_freq = (eval_freq or steps_per_task // 30) if self.evaluates else -1
+        env_kwargs = self.env_kwargs(n_tasks, seed)
+        return Run(algo, env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", env_kwargs, eval_freq)
+
+
+SUITES = {
+    "gym_control": Suite(
+        [env_id for env_id in ALL_ENVS if env_id.endswith(("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "MountainCar-v0"))],
+        lambda env, task: f"task {task}",
+        env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}", f"offset_seed:{seed}"),
+    ),
+    "procgen": Suite(
+        [
+            env_id
+            for env_id, kwargs in zip(ALL_ENVS, CONTINUAL_ENVS.values(), strict=True)
+            if "game" in kwargs.get("kwargs", {})
+        ],
+        lambda env, task: f"level {env.levels[task].start}",
+        env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}",),
+    ),
+    "dmc": Suite(
+        ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"],
+        lambda env, task: env.task_names[task],
+        own_scales=True,
+    ),
+    "minatar": Suite(
+        ["Continual/MinAtar-v0"],
+        lambda env, task: env.games[task],
+        algos=("double_dqn", "dqn_cchain"),
+        evaluates=True,
+        own_scales=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    What there is to know of a task without an agent.
+
+    :param name: For people
+    :param random_return: Mean return of uniformly random actions
+    :param frame: A picture of it, ``(height, width, 3)``, or None where it cannot be drawn
+    """
+
+    name: str
+    random_return: float
+    frame: np.ndarray | None
+
+
+def make_env(run: Run, task: int, **kwargs: Any) -> gym.Env:
+    """
+    :param run: A run
+    :param task: Number of one of its tasks
+    :param kwargs: Further arguments of the environment
+    :return: The run's environment, which stays on that task
+    """
+    for argument in run.env_kwargs:
+        name, value = argument.split(":")
+        kwargs[name] = int(value)
+    # Long enough to stay
+    return gym.make(run.env_id, first_task=task, steps_per_task=10**9, **kwargs)
+
+
+def look_at(suite: Suite, run: Run, task: int, n_episodes: int = 20, draw: bool = False) -> Task:
+    """
+    :param suite: The run's suite
+    :param run: A run
+    :param task: Number of one of its tasks
+    :param n_episodes: Episodes of random actions
+    :param draw: Whether a frame is wanted: that of the 30th step of the first episode
+    :return: The task
+    """
+    env = make_env(run, task, render_mode="rgb_array" if draw else None)
+    assert isinstance(env.unwrapped, ContinualEnv)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    returns: list[float] = []
+    frame = None
+    n_steps = 0
+    while len(returns) < n_episodes:
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        n_steps += 1
+        if draw and n_steps == 30:
+            frame = np.asarray(env.render())
+        if terminated or truncated:
+            returns.append(info["episode_return"])
+            env.reset()
+    env.close()
+    return Task(suite.task_name(env.unwrapped, task), float(np.mean(returns)), frame)
