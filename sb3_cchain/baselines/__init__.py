@@ -1,0 +1,21 @@
+"""The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm."""
+
+from sb3_cchain.baselines.adam_rel import AdamRel
+from sb3_cchain.baselines.l2_init import L2Init
+from sb3_cchain.baselines.optimizer_metrics import OptimizerMetrics
+from sb3_cchain.baselines.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.baselines.parseval import Parseval
+from sb3_cchain.baselines.penalty import Penalty
+from sb3_cchain.baselines.trac import TRAC
+from sb3_cchain.baselines.weight_clipping import WeightClipping
+
+__all__ = [
+    "TRAC",
+    "AdamRel",
+    "L2Init",
+    "OptimizerMetrics",
+    "OptimizerWrapper",
+    "Parseval",
+    "Penalty",
+    "WeightClipping",
+]

@@ -1,0 +1,52 @@
+"""An optimiser that adds a penalty on the parameters to the loss."""
+
+from typing import Any
+
+import torch as th
+from torch.optim.optimizer import ParamsT
+
+from sb3_cchain.baselines.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.validation import check_number
+
+
+class Penalty(OptimizerWrapper):
+    """
+    Minimises the loss plus ``coef`` times :meth:`penalty`.
+
+    Training loops run ``zero_grad → loss.backward → (clip) → step``, and gradients accumulate in PyTorch: ``zero_grad()``
+    leaves the penalty's gradient behind, so the update is the one of the sum, clipped as the sum is.
+
+    :param params: As for ``OptimizerWrapper``
+    :param lr: As for ``OptimizerWrapper``
+    :param coef: Weight of the penalty
+    :param kwargs: ``base_class`` and ``base_kwargs`` of ``OptimizerWrapper``
+    :raises ValueError: When ``coef`` is negative
+    """
+
+    def __init__(self, params: ParamsT, lr: float | th.Tensor = 1e-3, *, coef: float, **kwargs: Any):
+        check_number("coef", coef, minimum=0)
+        self.coef = coef
+        super().__init__(params, lr, **kwargs)
+
+    def penalty(self) -> th.Tensor:
+        """
+        :return: The penalty, a scalar through which gradients flow to the parameters
+        """
+        raise NotImplementedError()
+
+    @th.enable_grad()
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """
+        Set the gradients to those of the penalty.
+
+        :param set_to_none: As for any optimiser
+        """
+        super().zero_grad(set_to_none)
+        (self.coef * self.penalty()).backward()
+
+    @th.no_grad()
+    def metrics(self) -> dict[str, float]:
+        """
+        :return: What the wrappers inside did, and ``<name>/loss``, the penalty times ``coef``
+        """
+        return {**super().metrics(), f"{self.name}/loss": self.coef * self.penalty().item()}
