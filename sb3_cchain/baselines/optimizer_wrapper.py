@@ -72,7 +72,7 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     @property
     def own_state(self) -> dict[str, Any]:
-        """What the wrapper remembers. Values are replaced, not changed, as a saved state may share them."""
+        """What the wrapper remembers, by name. Replace the values, don't change them: a saved state shares them."""
         return self.state[self.name]  # an empty one at first: torch's state is a defaultdict
 
     def parameters(self) -> list[th.Tensor]:
@@ -141,3 +141,4 @@ class OptimizerWrapper(th.optim.Optimizer):
         super().__setstate__({name: value for name, value in state.items() if name not in of_base})
         if of_base:
             self.base.__setstate__(of_base)
+            self.state[self.name] = dict(self.own_state)  # the saved state's owner goes on with its own

@@ -1,0 +1,131 @@
+"""Penalties left behind by zero_grad equal penalties written into the loss."""
+
+import inspect
+import textwrap
+
+import pytest
+import stable_baselines3.ppo.ppo
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import set_random_seed
+from torch import nn
+
+from sb3_cchain.baselines import L2Init, Parseval
+
+COEF = 0.3
+
+
+def rewritten_train():
+    """SB3's ``PPO.train`` with a penalty in its loss."""
+    source = textwrap.dedent(inspect.getsource(PPO.train))
+    original = "loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss"
+    assert source.count(original) == 1, f"SB3 changed `{original}`"
+    namespace = dict(vars(stable_baselines3.ppo.ppo))
+    exec(source.replace(original, f"{original} + self.penalty()"), namespace)
+    return namespace["train"]
+
+
+class WrittenOutPPO(PPO):
+    train = rewritten_train()
+
+    def penalty(self):
+        return COEF * PENALTIES[self.kind][1](list(self.policy.parameters()), self.initial)
+
+
+def parseval(parameters, initial):
+    *weights, _, _ = [p for p in parameters if p.dim() == 2]  # action_net and value_net come last
+    return sum(((w @ w.T - 2 * th.eye(len(w))) ** 2).sum() for w in weights)
+
+
+PENALTIES = {
+    "l2_init": (
+        (L2Init, {}),
+        lambda parameters, initial: sum(((p - q) ** 2).sum() for p, q in zip(parameters, initial, strict=True)),
+    ),
+    "l2": ((L2Init, dict(towards="zero")), lambda parameters, initial: sum((p**2).sum() for p in parameters)),
+    "mean": (
+        (L2Init, dict(reduction="mean")),
+        lambda parameters, initial: (
+            (nn.utils.parameters_to_vector(parameters) - nn.utils.parameters_to_vector(initial)) ** 2
+        ).mean(),
+    ),
+    "parseval": ((Parseval, dict(n_output_layers=2)), parseval),
+}
+
+
+@pytest.mark.parametrize("kind", PENALTIES)
+@pytest.mark.parametrize("env_id, max_grad_norm", [("CartPole-v1", 0.5), ("CartPole-v1", 0.05), ("Pendulum-v1", 0.05)])
+def test_equals_sb3_source_with_the_penalty_in_its_loss(kind, env_id, max_grad_norm):
+    settings = dict(
+        n_steps=64, batch_size=16, n_epochs=3, learning_rate=3e-3, max_grad_norm=max_grad_norm, seed=0, device="cpu"
+    )
+    (cls, arguments), _ = PENALTIES[kind]
+    written_out = WrittenOutPPO("MlpPolicy", env_id, policy_kwargs=dict(net_arch=[8]), **settings)
+    written_out.kind = kind
+    written_out.initial = [p.detach().clone() for p in written_out.policy.parameters()]
+    optimizer_kwargs = dict(coef=COEF, base_kwargs=dict(eps=1e-5), **arguments)
+    policy_kwargs = dict(net_arch=[8], optimizer_class=cls, optimizer_kwargs=optimizer_kwargs)
+    model = PPO("MlpPolicy", env_id, policy_kwargs=policy_kwargs, **settings)
+    plain = PPO("MlpPolicy", env_id, policy_kwargs=dict(net_arch=[8]), **settings)
+    for each in (written_out, model, plain):
+        set_random_seed(0)
+        each.env.seed(0)
+        each.learn(3 * 64)
+    parameters, expected, without = (
+        nn.utils.parameters_to_vector(each.policy.parameters()) for each in (model, written_out, plain)
+    )
+    assert th.equal(parameters, expected)
+    assert (parameters - without).abs().max() > 1e-4
+
+
+def test_l2_init_by_hand():
+    parameter = nn.Parameter(th.tensor([1.0, 2.0]))
+    frozen = nn.Parameter(th.tensor([5.0]), requires_grad=False)
+    optimizer = L2Init([parameter, frozen], lr=0.1, coef=0.5, base_class=th.optim.SGD)
+    optimizer.zero_grad()
+    assert parameter.grad.tolist() == [0, 0]
+    with th.no_grad():
+        parameter.add_(th.tensor([3.0, 4.0]))
+    optimizer.zero_grad()
+    assert parameter.grad.tolist() == [3, 4]  # 2 · 0.5 · (θ - θ₀)
+    assert frozen.grad is None
+    assert optimizer.metrics() == {"l2_init/loss": 12.5, "l2_init/distance": 5.0}
+    optimizer.step()
+    assert parameter.tolist() == pytest.approx([4 - 0.3, 6 - 0.4])
+
+
+@pytest.mark.parametrize("reduction, gradient, loss", [("sum", [3, 4, 0], 12.5), ("mean", [1, 4 / 3, 0], 12.5 / 3)])
+def test_plain_l2_by_hand(reduction, gradient, loss):
+    parameters = [nn.Parameter(th.tensor([3.0, 4.0])), nn.Parameter(th.zeros(1))]
+    optimizer = L2Init(parameters, coef=0.5, towards="zero", reduction=reduction)
+    optimizer.zero_grad()
+    assert [*parameters[0].grad.tolist(), parameters[1].grad.item()] == pytest.approx(gradient)
+    assert optimizer.metrics() == {"l2_init/loss": pytest.approx(loss), "l2_init/distance": 5.0}
+
+
+def test_initial_parameters_are_those_of_the_first_update():
+    """Some policies initialise their weights after they made the optimiser, and SB3 loads and moves them later still."""
+    parameter = nn.Parameter(th.zeros(2))
+    optimizer = L2Init([parameter], coef=1.0)
+    with th.no_grad():
+        parameter.fill_(1.0)
+    optimizer.zero_grad()
+    assert optimizer.reference()[0].tolist() == [1, 1]
+
+
+def test_parseval_by_hand():
+    hidden, output = nn.Parameter(th.tensor([[1.0, 1.0], [0.0, 2.0]])), nn.Parameter(th.ones(1, 2))
+    convolution = nn.Parameter(th.tensor([[[[3.0]], [[0.0]]]]))  # one filter: the row (3, 0)
+    bias = nn.Parameter(th.ones(2))
+    optimizer = Parseval([convolution, hidden, bias, output], n_output_layers=1, coef=0.5)
+    optimizer.zero_grad()
+    # W Wᵀ - 2 I = [[0, 2], [2, 2]], of squared norm 12, with gradient 4 (W Wᵀ - 2 I) W; the convolution's: 9 - 2
+    assert optimizer.metrics() == {"parseval/loss": 0.5 * (12 + 49)}
+    assert hidden.grad.tolist() == [[0, 8], [4, 12]]
+    assert convolution.grad.flatten().tolist() == [0.5 * 4 * 7 * 3, 0]
+    assert bias.grad is None and output.grad is None
+
+
+def test_orthogonal_initialisation_has_no_parseval_loss():
+    weight = nn.Parameter(nn.init.orthogonal_(th.empty(6, 6), gain=2**0.5))
+    assert Parseval([weight], n_output_layers=0).metrics()["parseval/loss"] < 1e-10
