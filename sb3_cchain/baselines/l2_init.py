@@ -56,20 +56,29 @@ class L2Init(Penalty):
         self.reduction = reduction
         super().__init__(params, lr, coef=coef, **kwargs)
 
-    def _squared_distance(self) -> th.Tensor:
-        parameters = self.parameters()
+    def _differences(self) -> list[th.Tensor]:
         if self.towards == "zero":
-            differences = parameters
-        else:
-            differences = [p - initial for p, initial in zip(parameters, self.reference(), strict=True)]
-        return th.stack([difference.square().sum() for difference in differences]).sum()
+            return [parameter.clone() for parameter in self.parameters()]
+        return [parameter - initial for parameter, initial in zip(self.parameters(), self.reference(), strict=True)]
+
+    def _n_entries(self) -> int:
+        return sum(parameter.numel() for parameter in self.parameters()) if self.reduction == "mean" else 1
+
+    def _squared_distance(self) -> th.Tensor:
+        return th.stack([difference.square().sum() for difference in self._differences()]).sum()
 
     def penalty(self) -> th.Tensor:
         """
         :return: ‖θ − θ₀‖², or its mean over the entries
         """
-        n_entries = sum(parameter.numel() for parameter in self.parameters()) if self.reduction == "mean" else 1
-        return self._squared_distance() / n_entries
+        return self._squared_distance() / self._n_entries()
+
+    def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """
+        :return: 2 (θ − θ₀) for each parameter, or the mean's gradient
+        """
+        factor = 2 / self._n_entries()
+        return [(p, difference.mul_(factor)) for p, difference in zip(self.parameters(), self._differences(), strict=True)]
 
     @th.no_grad()
     def metrics(self) -> dict[str, float]:

@@ -25,7 +25,7 @@ class Parseval(Penalty):
 
     Logged: ``parseval/loss``, the penalty times c.
 
-    Costs two products of a matrix and its transpose per weight matrix and update.
+    Costs two matrix products per weight matrix and update.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate
@@ -58,12 +58,26 @@ class Parseval(Penalty):
             raise ValueError(f"`n_output_layers` must leave a weight matrix to regularise, got {n_output_layers!r}")
 
     def _weights(self) -> list[th.Tensor]:
-        weights = [parameter.flatten(start_dim=1) for parameter in self.parameters() if parameter.dim() > 1]
+        weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
         return weights[: len(weights) - self.n_output_layers]
+
+    def _deviation(self, matrix: th.Tensor) -> th.Tensor:
+        deviation = matrix @ matrix.T
+        deviation.diagonal().sub_(self.scale)
+        return deviation
 
     def penalty(self) -> th.Tensor:
         """
         :return: Σ ‖W Wᵀ − s·I‖²_F
         """
-        deviations = [weight @ weight.T - self.scale * th.eye(len(weight)).to(weight) for weight in self._weights()]
-        return th.stack([deviation.square().sum() for deviation in deviations]).sum()
+        return th.stack([self._deviation(weight.flatten(start_dim=1)).square().sum() for weight in self._weights()]).sum()
+
+    def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """
+        :return: 4 (W Wᵀ − s·I) W for each weight matrix W
+        """
+        gradients = []
+        for weight in self._weights():
+            matrix = weight.flatten(start_dim=1)
+            gradients.append((weight, (4 * self._deviation(matrix) @ matrix).view_as(weight)))
+        return gradients
