@@ -36,8 +36,8 @@ class Penalty(OptimizerWrapper):
 
     def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """
-        :return: The parameters that the penalty depends on, each with its gradient. In closed form: autograd takes several times
-            as long for a sum of squares.
+        :return: The parameters that the penalty depends on, each with its gradient, a new tensor. It is asked for in closed
+            form, as autograd takes several times as long for a sum of squares.
         """
         raise NotImplementedError()
 
