@@ -58,14 +58,22 @@ class MinAtarCNN(_ImageExtractor):
     :param observation_space: ``Box`` of shape (height, width, channels), of any dtype; or an image that SB3 has transposed to
         (channels, height, width)
     :param features_dim: Number of features
+    :param layer_norm: Whether both ReLUs have a LayerNorm before them: of the flattened convolutional features (1024 for the
+        games), and of the output of the linear layer, as in :class:`ImpalaCNN`
     :raises ValueError: For another observation space, or one smaller than 3×3
     """
 
-    def __init__(self, observation_space: spaces.Box, features_dim: int = 128):
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 128, layer_norm: bool = False):
         super().__init__(observation_space, features_dim, min_size=3)
-        self.cnn = nn.Sequential(nn.Conv2d(self.n_channels, 16, kernel_size=3), nn.ReLU())
+        convolution = nn.Conv2d(self.n_channels, 16, kernel_size=3)
         n_flatten = 16 * (self.height - 2) * (self.width - 2)
-        self.linear = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.ReLU())
+        layers: list[nn.Module] = [nn.Linear(n_flatten, features_dim), nn.ReLU()]
+        if layer_norm:
+            self.cnn = nn.Sequential(convolution)
+            layers = [nn.LayerNorm(n_flatten), nn.ReLU(), layers[0], nn.LayerNorm(features_dim), layers[1]]
+        else:
+            self.cnn = nn.Sequential(convolution, nn.ReLU())
+        self.linear = nn.Sequential(*layers)
 
 
 class ImpalaCNN(_ImageExtractor):

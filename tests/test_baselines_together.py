@@ -1,0 +1,44 @@
+"""The baselines that act by callbacks and networks, all at once, with each algorithm."""
+
+import pytest
+import torch as th
+from stable_baselines3 import DQN
+
+from sb3_cchain import TaskSync
+from sb3_cchain.baselines import LayerNormDQNPolicy, LayerNormPolicy, Oracle, ReDo, ShrinkAndPerturb
+from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, make_env, make_model, parameters
+
+
+def callbacks():
+    return [TaskSync(), Oracle(), ReDo(tau=0.3, interval=1), ShrinkAndPerturb(shrink=0.999, interval=2)]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_train_save_load_and_go_on(tmp_path, name):
+    policy = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
+    model = make_model(name, policy=policy, policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU))
+    first = callbacks()
+    model.learn(STEPS_PER_TASK + 16, callback=first).save(tmp_path / "model")
+    _, oracle, redo, shrink = first
+    assert oracle.n_resets == 1 and redo.n_recycled > 0 and shrink.n_steps > 0
+
+    loaded = type(model).load(tmp_path / "model", env=make_env(), device="cpu")
+    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
+    state, loaded_state = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
+    assert len(state) > 0
+    for index, moments in state.items():
+        assert all(th.equal(value, loaded_state[index][key]) for key, value in moments.items())
+    before, second = parameters(loaded), callbacks()
+    if isinstance(loaded, DQN):
+        loaded.learning_starts = loaded.num_timesteps + 4
+    loaded.learn(STEPS_PER_TASK, callback=second, reset_num_timesteps=False)
+    assert second[1].n_resets == 1
+    assert all(not th.equal(tensor, before[name]) for name, tensor in parameters(loaded).items() if "target" not in name)
+    loaded.set_parameters(model.get_parameters())
+    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_repeats_with_the_seed(name):
+    one, other = (make_model(name).learn(2 * STEPS_PER_TASK, callback=callbacks()) for _ in range(2))
+    assert all(th.equal(p, q) for p, q in zip(one.policy.parameters(), other.policy.parameters(), strict=True))

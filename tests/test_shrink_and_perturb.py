@@ -1,0 +1,114 @@
+"""Shrink-and-perturb."""
+
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cchain.baselines import ShrinkAndPerturb
+from sb3_cchain.baselines import shrink_and_perturb as module
+from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, make_model, make_random_env, parameters
+from tests.envs import CountEnv, RandomEnv
+
+
+class Spy(BaseCallback):
+    def __init__(self):
+        super().__init__()
+        self.seen = {}
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_start(self):
+        self.seen[self.model.num_timesteps] = parameters(self.model)
+
+
+@pytest.fixture
+def draws(monkeypatch):
+    """The fresh policies that were built."""
+    built = []
+    fresh_policy = module.fresh_policy
+    monkeypatch.setattr(module, "fresh_policy", lambda model: built.append(fresh_policy(model)) or built[-1])
+    return built
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_by_hand_at_a_switch(name, draws):
+    """With a learning rate of 0 nothing else moves the parameters."""
+    spy = Spy()
+    model = make_model(name, learning_rate=0.0, target_update_interval=10_000) if "DQN" in name else make_model(name)
+    if "DQN" not in name:
+        model.lr_schedule = lambda _: 0.0
+    model.learn(3 * STEPS_PER_TASK, callback=[ShrinkAndPerturb(shrink=0.75, interval=None), spy])
+    assert len(draws) == 2
+    theta = spy.seen[0]
+    for task, draw in enumerate(draws, start=1):
+        phi = dict(draw.named_parameters())
+        for key, tensor in spy.seen[task * STEPS_PER_TASK].items():
+            expected = theta[key] if "target" in key else 0.75 * theta[key] + 0.25 * phi[key]
+            assert th.allclose(tensor, expected, rtol=1e-6, atol=1e-7), key
+            assert th.equal(tensor, spy.seen[task * STEPS_PER_TASK + 16][key])
+        theta = spy.seen[task * STEPS_PER_TASK]
+    key = "q_net.q_net.0.weight" if "DQN" in name else "action_net.weight"
+    first, second = (draw.get_parameter(key) for draw in draws)
+    assert not th.equal(first, second)
+
+
+@pytest.mark.parametrize("name, n_steps, n_updates", [("PPO", 48, 3 * 4), ("CChainPPO", 48, 3 * 4), ("CChainDQN", 20, 12)])
+@pytest.mark.parametrize("interval", [1, 5])
+def test_counts_updates(name, n_steps, n_updates, interval, draws):
+    callback = ShrinkAndPerturb(interval=interval)
+    model = make_model(name, env=make_random_env())
+    model.learn(n_steps, callback=callback)
+    assert callback.n_steps == len(draws) == n_updates // interval
+    # Nothing stays hooked
+    model.learn(n_steps)
+    assert callback.n_steps == n_updates // interval
+
+
+def test_after_each_update_by_hand(draws):
+    model = make_model("PPO", env=make_random_env(), n_epochs=1)
+    model.lr_schedule = lambda _: 0.0
+    expected = parameters(model)
+    model.learn(32, callback=ShrinkAndPerturb(shrink=0.5, interval=1))
+    assert len(draws) == 4
+    for draw in draws:
+        expected = {key: 0.5 * expected[key] + 0.5 * phi for key, phi in draw.named_parameters()}
+    for key, parameter in model.policy.named_parameters():
+        assert th.allclose(parameter, expected[key], rtol=1e-5, atol=1e-7), key
+
+
+def test_interrupted_training_leaves_one_hook():
+    callback = ShrinkAndPerturb(interval=1)
+    model = make_model("PPO", env=make_random_env())
+
+    class Interrupt(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 20:
+                raise KeyboardInterrupt
+            return True
+
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(48, callback=[callback, Interrupt()])
+    model.learn(16, callback=callback)
+    assert callback.n_steps == 4
+
+
+@pytest.mark.parametrize("interval, remembers", [(1, True), (4, False)])
+def test_c_chain(interval, remembers):
+    model = make_model("CChainPPO", env=make_random_env())
+    # The fourth update is the last
+    model.learn(16, callback=ShrinkAndPerturb(interval=interval))
+    assert (model.churn_reducer.reference is not None) == remembers
+
+
+def test_what_it_refuses():
+    for argument, value in [("shrink", 1.5), ("shrink", -0.1), ("interval", 0), ("interval", 2.5)]:
+        with pytest.raises(ValueError, match=f"`{argument}` must be .* got {value}"):
+            ShrinkAndPerturb(**{argument: value})
+    with pytest.raises(TypeError, match="the training environment is not one"):
+        make_model("PPO", env=CountEnv()).learn(10, callback=ShrinkAndPerturb(interval=None))
+    box = RandomEnv(action_space=spaces.Box(-1, 1, (2,)))
+    with pytest.raises(TypeError, match="ShrinkAndPerturb is for algorithms with a single optimiser .*, got SAC"):
+        SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=ShrinkAndPerturb())
