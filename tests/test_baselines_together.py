@@ -42,3 +42,21 @@ def test_train_save_load_and_go_on(tmp_path, name):
 def test_repeats_with_the_seed(name):
     one, other = (make_model(name).learn(2 * STEPS_PER_TASK, callback=callbacks()) for _ in range(2))
     assert all(th.equal(p, q) for p, q in zip(one.policy.parameters(), other.policy.parameters(), strict=True))
+
+
+def test_by_name_from_yaml():
+    """As the stock RL Zoo reads `policy:`, `policy_kwargs:` and `callback:`."""
+    utils = pytest.importorskip("rl_zoo3.utils")
+    entries = [
+        "sb3_cchain.TaskSync",
+        {"sb3_cchain.baselines.Oracle": {"reset_replay_buffer": True}},
+        {"sb3_cchain.baselines.ReDo": {"tau": 0.1, "interval": 5}},
+        {"sb3_cchain.baselines.ShrinkAndPerturb": {"shrink": 0.5, "interval": None}},
+    ]
+    made = utils.get_callback_list({"callback": entries})
+    policy = utils.get_class_by_name("sb3_cchain.baselines.LayerNormDQNPolicy")
+    activation_fn = utils.get_class_by_name("sb3_cchain.baselines.CReLU")
+    model = make_model("DQN", policy=policy, policy_kwargs=dict(net_arch=[8], activation_fn=activation_fn))
+    model.learn(2 * STEPS_PER_TASK, callback=made)
+    assert made[1].n_resets == made[3].n_steps == 1
+    assert made[2].tau == 0.1

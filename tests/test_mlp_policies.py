@@ -65,15 +65,19 @@ def test_layer_norm_by_hand():
 
 def test_layers_of_a_q_network():
     policy = make(DQN, LayerNormDQNPolicy, net_arch=[5, 6]).policy
-    assert kinds(policy.q_net.q_net) == kinds(policy.q_net_target.q_net) == [
-        ("Linear", (5, 4), (5,)),
-        ("LayerNorm", (5,), (5,)),
-        ("ReLU",),
-        ("Linear", (6, 5), (6,)),
-        ("LayerNorm", (6,), (6,)),
-        ("ReLU",),
-        ("Linear", (3, 6), (3,)),
-    ]
+    assert (
+        kinds(policy.q_net.q_net)
+        == kinds(policy.q_net_target.q_net)
+        == [
+            ("Linear", (5, 4), (5,)),
+            ("LayerNorm", (5,), (5,)),
+            ("ReLU",),
+            ("Linear", (6, 5), (6,)),
+            ("LayerNorm", (6,), (6,)),
+            ("ReLU",),
+            ("Linear", (3, 6), (3,)),
+        ]
+    )
     assert len(policy.optimizer.param_groups[0]["params"]) == 10
     default = make(DQN, LayerNormDQNPolicy).policy
     assert [m.out_features for m in default.q_net.q_net if isinstance(m, nn.Linear)] == [64, 64, 3]
@@ -135,7 +139,13 @@ def test_minatar_network():
     network = MinAtarCNN(space, layer_norm=True)
     assert kinds(network.cnn) == [("Conv2d", (16, 4, 3, 3), (16,))]
     norm = ("LayerNorm", (1024,), (1024,))
-    assert kinds(network.linear) == [norm, ("ReLU",), ("Linear", (128, 1024), (128,)), ("LayerNorm", (128,), (128,)), ("ReLU",)]
+    assert kinds(network.linear) == [
+        norm,
+        ("ReLU",),
+        ("Linear", (128, 1024), (128,)),
+        ("LayerNorm", (128,), (128,)),
+        ("ReLU",),
+    ]
     inputs = th.rand(3, 10, 10, 4)
     features = network.cnn(inputs.permute(0, 3, 1, 2)).permute(0, 2, 3, 1).flatten(start_dim=1)
     hidden = nn.functional.layer_norm(features, (1024,)).relu()

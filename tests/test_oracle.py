@@ -201,7 +201,7 @@ def test_what_it_refuses():
     with pytest.raises(TypeError, match="`reset_replay_buffer=True` is for off-policy algorithms, got PPO"):
         make_model("PPO").learn(10, callback=Oracle(reset_replay_buffer=True))
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,), np.float32))
-    with pytest.raises(TypeError, match="Oracle is for algorithms with a single optimiser .*, got SAC"):
+    with pytest.raises(TypeError, match=r"Oracle is for algorithms with a single optimiser .*, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=Oracle())
     oracle, model = Oracle(reset_replay_buffer=True), make_model("DQN")
     model.replay_buffer = HerReplayBuffer.__new__(HerReplayBuffer)

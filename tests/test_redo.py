@@ -42,7 +42,7 @@ def test_recycled_units_by_hand(amsgrad):
     optimizer = one_adam_step(network, inputs, amsgrad=amsgrad)
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
     moments = {name: {k: v.clone() for k, v in optimizer.state[p].items()} for name, p in network.named_parameters()}
-    (first, _) = find_hidden_units(network.eval(), lambda: network(th.zeros(1, 2)))
+    first, _ = find_hidden_units(network.eval(), lambda: network(th.zeros(1, 2)))
     recycle_units(first, th.tensor([False, True, False, True]), network, fresh, optimizer)
 
     changed = {name: th.zeros_like(p, dtype=th.bool) for name, p in before.items()}
@@ -132,7 +132,10 @@ def policies():
     yield PPO, "MlpPolicy", None, small, {mlp: [1, 2], "mlp_extractor.value_net.0": [3]}
     yield A2C, "MlpPolicy", None, small, {mlp: [1, 2]}
     yield PPO, "MultiInputPolicy", DICT, small, {mlp: [0]}
-    yield PPO, "CnnPolicy", FRAMES, dict(nature, net_arch=[]), {"features_extractor.cnn.4": [3], "features_extractor.cnn.0": [7]}
+    yield PPO, "CnnPolicy", FRAMES, dict(nature, net_arch=[]), {
+        "features_extractor.cnn.4": [3],
+        "features_extractor.cnn.0": [7],
+    }
     yield PPO, "CnnPolicy", IMAGES, dict(minatar, net_arch=[]), {"features_extractor.cnn.0": [3, 9]}
     yield PPO, "CnnPolicy", IMAGES, dict(minatar, **separate), {"vf_features_extractor.cnn.0": [2], mlp: [7]}
     yield PPO, ImpalaPolicy, IMAGES, impala, {"features_extractor.cnn.2.residual.1": [1], "features_extractor.linear.1": [2]}
@@ -323,6 +326,23 @@ def test_what_it_refuses():
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=ReDo())
     with pytest.raises(ValueError, match="ReDo finds no hidden unit"):
         make_model("PPO", policy_kwargs=dict(net_arch=[])).learn(10, callback=ReDo())
+
+
+@pytest.mark.parametrize(
+    "action_space, settings",
+    [
+        (spaces.Box(-1, 1, (2,), np.float32), {}),
+        (spaces.Box(-1, 1, (2,), np.float32), dict(use_sde=True)),
+        (spaces.MultiDiscrete([2, 3]), {}),
+        (spaces.MultiBinary(2), {}),
+    ],
+)
+def test_action_spaces(action_space, settings):
+    redo = ReDo(tau=1.0, interval=1)
+    model = make_model("CChainPPO", env=RandomEnv(action_space=action_space), **settings)
+    model.learn(48, callback=redo)
+    assert [layer.layer for layer in redo._layers] == ["mlp_extractor.policy_net.0", "mlp_extractor.value_net.0"]
+    assert redo.n_recycled > 0
 
 
 def test_of_a_layer_norm_network():

@@ -95,12 +95,19 @@ def test_interrupted_training_leaves_one_hook():
     assert callback.n_steps == 4
 
 
-@pytest.mark.parametrize("interval, remembers", [(1, True), (4, False)])
-def test_c_chain(interval, remembers):
-    model = make_model("CChainPPO", env=make_random_env())
-    # The fourth update is the last
-    model.learn(16, callback=ShrinkAndPerturb(interval=interval))
-    assert (model.churn_reducer.reference is not None) == remembers
+def test_c_chain_forgets_at_a_switch():
+    remembered = []
+
+    class SpyReducer(Spy):
+        def _on_rollout_start(self):
+            remembered.append(self.model.churn_reducer.reference is not None)
+
+    callback = ShrinkAndPerturb(shrink=0.5, interval=None)
+    make_model("CChainPPO").learn(3 * STEPS_PER_TASK, callback=[callback, SpyReducer()])
+    assert remembered == [False, True] + [False, True] * 2
+    remembered.clear()
+    make_model("CChainPPO").learn(3 * STEPS_PER_TASK, callback=[ShrinkAndPerturb(interval=4), SpyReducer()])
+    assert remembered == [False] + [True] * 5
 
 
 def test_what_it_refuses():
@@ -110,5 +117,5 @@ def test_what_it_refuses():
     with pytest.raises(TypeError, match="the training environment is not one"):
         make_model("PPO", env=CountEnv()).learn(10, callback=ShrinkAndPerturb(interval=None))
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,)))
-    with pytest.raises(TypeError, match="ShrinkAndPerturb is for algorithms with a single optimiser .*, got SAC"):
+    with pytest.raises(TypeError, match=r"ShrinkAndPerturb is for algorithms with a single optimiser .*, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=ShrinkAndPerturb())

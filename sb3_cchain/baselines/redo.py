@@ -42,8 +42,9 @@ class ReDo(BaseCallback):
     known: not one whose output is added to a residual stream (in an IMPALA network the first convolution of each residual
     block and the linear layer are recycled, as in the original's), nor an output of the network.
 
-    Defaults: τ = 0.025 and 1000 updates as the original's DQN, 10 iterations for on-policy algorithms and τ as there as
-    Plasticine's PPO. The settings of the C-CHAIN paper's ReDo have not been published. The batch is the original's 256.
+    Defaults: τ = 0.025 and 1000 updates are those of the paper's DQN; for on-policy algorithms, 10 iterations and the same τ
+    those of Plasticine's PPO (https://github.com/RLE-Foundation/Plasticine). The batch is the original code's 256. What the
+    C-CHAIN paper compares with has not been published.
 
     Deviations from the original code: the incoming weights have the initialisation of the policy at hand (orthogonal, Xavier,
     PyTorch's), where it draws after Xavier; the bias, too, where it becomes 0. The activation is measured where the next layer

@@ -28,8 +28,8 @@ class ShrinkAndPerturb(TaskBoundary):
     Each step builds the policy anew, which with ``interval=1`` may cost more than the update itself. A step with
     :math:`\alpha^n` after every :math:`n` updates shrinks alike at an n-th of the cost.
 
-    The optimiser's moments and the target network are left alone. With C-CHAIN, the change counts as churn of the update
-    when ``interval=1``; otherwise the reference batch is forgotten, so that churn reduction does not undo it.
+    The optimiser's moments and the target network are left alone. With C-CHAIN, a step after an update counts as part of it,
+    also in its churn; at a task switch the reference batch is forgotten, so that churn reduction does not undo the step.
 
     Logged: ``shrink_and_perturb/n_steps``, the steps since ``learn()`` was called.
 
@@ -83,6 +83,8 @@ class ShrinkAndPerturb(TaskBoundary):
 
     def _on_task_switch(self) -> None:
         self._shrink_and_perturb()
+        for reducer in churn_reducers(self):
+            reducer.forget_reference()
 
     def _shrink_and_perturb(self) -> None:
         fresh = fresh_policy(self.model)
@@ -91,9 +93,6 @@ class ShrinkAndPerturb(TaskBoundary):
             for group, fresh_group in zip(self.model.policy.optimizer.param_groups, fresh.optimizer.param_groups, strict=True):
                 for parameter, draw in zip(group["params"], fresh_group["params"], strict=True):
                     parameter.mul_(self.shrink).add_(draw, alpha=1 - self.shrink)
-        if self.interval != 1:
-            for reducer in churn_reducers(self):
-                reducer.forget_reference()
         self.n_steps += 1
 
     def _on_rollout_end(self) -> None:
