@@ -10,14 +10,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
 from sb3_cchain import CChainCallback
-from sb3_cchain.baselines import LayerNormPolicy, ReDo
+from sb3_cchain.baselines import L2Init, LayerNormPolicy, ReDo, WeightClipping
 from sb3_cchain.baselines.hidden_units import find_hidden_units
 from sb3_cchain.baselines.redo import recycle_units
 from sb3_cchain.common.policies import ImpalaPolicy
 from sb3_cchain.common.torch_layers import MinAtarCNN
 from tests.baseline_models import ALGORITHMS, make_model, make_random_env, parameters
 from tests.envs import RandomEnv
-from tests.test_leaf_optimizer import Wrapper
 
 IMAGES = spaces.Box(0, 255, (12, 12, 3), np.uint8)
 FRAMES = spaces.Box(0, 255, (36, 36, 1), np.uint8)
@@ -276,11 +275,12 @@ def test_scores_of_a_network_by_hand(name):
 
 
 def test_moments_inside_a_wrapped_optimizer():
-    model = make_model("PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[4], activation_fn=nn.ReLU))
-    adam = model.policy.optimizer
+    optimizer = dict(optimizer_class=L2Init, optimizer_kwargs=dict(base_class=WeightClipping))
+    model = make_model("PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[4], activation_fn=nn.ReLU, **optimizer))
+    adam = model.policy.optimizer.base.base
+    assert isinstance(adam, th.optim.Adam)
     model.learn(16)
     kill(model.policy, "mlp_extractor.policy_net.0", [1])
-    model.policy.optimizer = Wrapper(adam)
     redo = ReDo(tau=0.0, interval=1)
     redo.init_callback(model)
     redo.on_training_start({}, {})

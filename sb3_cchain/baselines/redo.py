@@ -17,7 +17,6 @@ from sb3_cchain.baselines.churn_reducers import churn_reducers
 from sb3_cchain.baselines.dormancy import dormant_scores
 from sb3_cchain.baselines.fresh_policy import fresh_policy
 from sb3_cchain.baselines.hidden_units import HiddenUnits, find_hidden_units, hidden_activity
-from sb3_cchain.baselines.leaf_optimizer import leaf_optimizer
 from sb3_cchain.validation import check_number
 
 DEFAULT_INTERVAL_ON_POLICY = 10
@@ -134,9 +133,9 @@ class ReDo(BaseCallback):
         dormant = [dormant_scores(of_layer) <= self.tau for of_layer in activity]
         n_dormant = sum(int(units.sum()) for units in dormant)
         if n_dormant:
-            fresh, optimizer = fresh_policy(self.model), leaf_optimizer(policy.optimizer)
+            fresh = fresh_policy(self.model)
             for layer, units in zip(self._layers, dormant, strict=True):
-                recycle_units(layer, units, policy, fresh, optimizer)
+                recycle_units(layer, units, policy, fresh, policy.optimizer)
             for reducer in churn_reducers(self):
                 reducer.forget_reference()
         self.n_recycled += n_dormant
