@@ -60,7 +60,11 @@ class DeepCopyPPO(PPO):
                 clipped_ratio = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
                 actor_loss = -th.min(advantages * ratio, advantages * clipped_ratio).mean()
                 actor_loss = actor_loss - self.ent_coef * entropy.mean()  # type: ignore[union-attr]
-                loss = actor_loss + self.vf_coef * F.mse_loss(batch.returns, values.flatten())
+                values = values.flatten()
+                if self.clip_range_vf is not None:
+                    clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+                    values = batch.old_values + th.clamp(values - batch.old_values, -clip_range_vf, clip_range_vf)
+                loss = actor_loss + self.vf_coef * F.mse_loss(batch.returns, values)
                 actor_losses.append(actor_loss.item())
 
                 if self.old_policy is not None:

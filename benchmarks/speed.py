@@ -1,9 +1,10 @@
 """
 What churn reduction costs: the base algorithm, C-CHAIN, and the loop that copies the network at every minibatch, timed in turn
-in one process under the shipped settings. Prints ratios; the machine's own speed drops out.
+in one process under the shipped settings. Prints ratios, so that the machine's own speed drops out, and how many times as many
+floating-point operations are needed.
 
     python -m benchmarks.speed
-    python -m benchmarks.speed --case minatar
+    python -m benchmarks.speed --case minatar procgen
 """
 
 import argparse
@@ -22,6 +23,7 @@ from rich.table import Table
 from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import PPO
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
@@ -29,7 +31,7 @@ from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.zoo import hyperparams_folder
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
-NOT_THE_MODELS = {"callback", "env_wrapper", "monitor_kwargs", "n_timesteps"}
+NOT_THE_MODELS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}
 
 
 @dataclass
@@ -57,20 +59,25 @@ def settings_of(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
     settings = yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text())[env_id]
     settings = {name: value for name, value in settings.items() if name not in NOT_THE_MODELS}
     # As RL Zoo reads it
-    settings["policy_kwargs"] = eval(settings["policy_kwargs"], {"nn": nn, "get_class_by_name": get_class_by_name})
+    if "policy_kwargs" in settings:
+        settings["policy_kwargs"] = eval(settings["policy_kwargs"], {"nn": nn, "get_class_by_name": get_class_by_name})
+    if "." in settings["policy"]:
+        settings["policy"] = get_class_by_name(settings["policy"])
     return {**settings, "env": env_id, "seed": 0, "device": "cpu", **changed}
 
 
-def gym_control() -> Case:
+def ppo(env_id: str, **changed: Any) -> Case:
     """
-    :return: PPO under the Gym Control settings: two networks of 3 × 256 units, minibatches of 32
+    :param env_id: Environment id
+    :param changed: What shall differ from the shipped settings
+    :return: PPO under the settings of that environment
     """
-    settings = settings_of("ppo", "Continual/Acrobot-v1")
+    settings = settings_of("ppo", env_id, **changed)
     models = {"PPO": PPO(**settings), "CChainPPO": CChainPPO(**settings), "deep copy": DeepCopyPPO(**settings)}
     for model in models.values():
         model.learn(2 * model.n_steps)  # warm; every later update has a churn loss
     return Case(
-        "Continual/Acrobot-v1",
+        env_id,
         models,
         {
             "train()": lambda model: model.train(),
@@ -104,7 +111,10 @@ def minatar(n_past_updates: int = 0) -> Case:
 
 
 CASES: dict[str, Callable[[], Case]] = {
-    "gym_control": gym_control,
+    "gym_control": partial(ppo, "Continual/Acrobot-v1"),
+    # A shorter rollout and one epoch of it, as a round would take minutes
+    "procgen": partial(ppo, "Continual/Starpilot-v0", n_steps=500, n_epochs=1),
+    "dmc": partial(ppo, "Continual/Walker-v0", n_epochs=1),
     "minatar": minatar,
     "minatar_later": partial(minatar, n_past_updates=50_000),
 }
@@ -120,14 +130,25 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
+def n_operations(call: Callable[[], Any]) -> int:
+    """
+    :param call: What to count
+    :return: Floating-point operations of its matrix products and convolutions
+    """
+    with FlopCounterMode(display=False) as counter:
+        call()
+    return counter.get_total_flops()
+
+
 def ratios(case: Case, n_rounds: int) -> Table:
     """
     :param case: What to time
     :param n_rounds: Timings of each
-    :return: Ratios within a round
+    :return: Ratios of the seconds within a round, and of the operations of the first measure
     """
     base, ours, copying = case.models
-    table = Table("", "ratio", "median", "min", "max", title=f"{case.title}, {n_rounds} rounds, one thread")
+    title = f"{case.title}, {n_rounds} rounds, one thread"
+    table = Table("", "ratio", "median", "min", "max", title=title)
     for measure, call in case.measures.items():
         rounds = [
             {name: seconds(partial(call, model)) for name, model in case.models.items()}
@@ -136,6 +157,9 @@ def ratios(case: Case, n_rounds: int) -> Table:
         for one, other in ((ours, base), (ours, copying), (copying, base)):
             figures = [timing[one] / timing[other] for timing in rounds]
             table.add_row(measure, f"{one} / {other}", *(f"{f(figures):.2f}" for f in (np.median, np.min, np.max)))
+    train = next(iter(case.measures.values()))
+    needed, of_base = (n_operations(partial(train, case.models[name])) for name in (ours, base))
+    table.caption = f"Floating-point operations of {ours} / {base}: {needed / of_base:.2f}"
     return table
 
 
