@@ -1,5 +1,6 @@
 """RL Zoo's command line with our algorithms, and the stock one."""
 
+import ast
 import json
 import os
 import pickle
@@ -14,8 +15,11 @@ import pytest
 import torch as th
 import yaml
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.save_util import load_from_pkl
 
+import sb3_cchain.baselines as baselines
 import sb3_cchain.zoo as zoo
+import sb3_cchain.zoo_search as zoo_search
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.envs import TaskVecNormalize
@@ -365,6 +369,227 @@ def test_search_space_depends_on_the_actions():
 
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for n_actions, low, high in ((0, 1e2, 1e6), (2, 5e-3, 5.0)):
-        ratios = [zoo.sample_ppo_cchain_params(study.ask(), n_actions, 1, {})["target_churn_ratio"] for _ in range(20)]
+        ratios = [zoo_search.sample_ppo_cchain_params(study.ask(), n_actions, 1, {})["target_churn_ratio"] for _ in range(20)]
         assert low <= min(ratios) < max(ratios) <= high
         assert np.ptp(np.log10(ratios)) > 1
+
+
+# --- The related methods --------------------------------------------------------------------------------------------------
+
+SUITES = {"gym_control": GYM_CONTROL, "procgen": PROCGEN, "dmc": DMC, "minatar": ["Continual/MinAtar-v0"]}
+ADAM = "optimizer_kwargs=dict(eps=1e-8, fused=True)"
+METRICS = ["sb3_cchain.baselines.OptimizerMetrics"]
+ORACLE = "sb3_cchain.baselines.Oracle"
+REDO = {"sb3_cchain.baselines.ReDo": {"tau": 0.025, "interval": 10, "batch_size": 256}}
+
+
+def optimizer(name, arguments):
+    return f"optimizer_class=get_class_by_name('sb3_cchain.baselines.{name}'), optimizer_kwargs=dict({arguments})"
+
+
+# The callbacks that are added, and what stands for Adam's arguments among those of the policy
+DIFFERENCES = {
+    ("ppo_oracle", "gym_control"): ([ORACLE], ADAM),
+    ("ppo_oracle", "procgen"): ([ORACLE], ""),
+    ("ppo_oracle", "dmc"): ([ORACLE], ""),
+    ("ppo_trac", "gym_control"): (METRICS, optimizer("TRAC", "base_kwargs=dict(eps=1e-8, fused=True)")),
+    ("ppo_trac", "procgen"): (METRICS, optimizer("TRAC", "base_kwargs=dict(eps=1e-8)")),
+    ("ppo_weight_clipping", "gym_control"): (
+        METRICS,
+        optimizer("WeightClipping", "clip_ratio=1.0, base_kwargs=dict(eps=1e-8, fused=True)"),
+    ),
+    ("ppo_weight_clipping", "procgen"): (METRICS, optimizer("WeightClipping", "clip_ratio=1.0, base_kwargs=dict(eps=1e-5)")),
+    ("ppo_l2_init", "gym_control"): (
+        METRICS,
+        optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-8, fused=True)"),
+    ),
+    ("ppo_l2_init", "procgen"): (METRICS, optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-5)")),
+    ("ppo_layer_norm", "procgen"): ([], "features_extractor_kwargs=dict(layer_norm=True)"),
+    ("ppo_redo", "procgen"): ([REDO], ""),
+    ("ppo_adam_rel", "procgen"): (["sb3_cchain.baselines.AdamRel"], ""),
+    ("double_dqn_oracle", "minatar"): ([{ORACLE: {"reset_replay_buffer": True}}], ""),
+}
+
+
+def parsed(settings):
+    """Whatever the line breaks."""
+    expression = ast.parse(settings.get("policy_kwargs", "dict()"), mode="eval")
+    return {**settings, "policy_kwargs": ast.dump(expression)}
+
+
+@pytest.mark.parametrize("method, algo", zoo.METHODS.items())
+def test_a_method_differs_from_its_algorithm_in_itself_alone(method, algo):
+    settings, vanilla = settings_of(method), settings_of(algo)
+    expected = {}
+    for suite in (suite for name, suite in DIFFERENCES if name == method):
+        callbacks, arguments = DIFFERENCES[method, suite]
+        for env_id in SUITES[suite]:
+            of_env = vanilla[env_id]
+            policy_kwargs = of_env.get("policy_kwargs", f"dict({ADAM})" if arguments else "dict()").replace(ADAM, arguments)
+            expected[env_id] = {**of_env, "callback": [*of_env["callback"], *callbacks], "policy_kwargs": policy_kwargs}
+    covered = {env_id: of_env for env_id, of_env in settings.items() if not env_id.endswith("-defaults")}
+    assert {env_id: parsed(of_env) for env_id, of_env in covered.items()} == {
+        env_id: parsed(of_env) for env_id, of_env in expected.items()
+    }
+
+
+METHOD_ROLLOUTS = {
+    "gym_control": ("Continual/Acrobot-v1", 64, 32),
+    "procgen": ("Continual/Starpilot-v0", 32, 16),
+    "dmc": ("Continual/Walker-v0", 64, 32),
+}
+
+
+def train(monkeypatch, folder, method, env_id, n_steps, *arguments):
+    arguments = [*arguments, "--eval-freq", "-1", "--seed", "0", "--num-threads", "1", "--device", "cpu", "--verbose", "0"]
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        ["sb3-cchain", "train", "--algo", method, "--env", env_id, "-n", str(n_steps), "-f", str(folder), *arguments],
+    )
+    zoo.main()
+
+
+@pytest.mark.parametrize("method, suite", [key for key in DIFFERENCES if key[1] != "minatar"])
+@pytest.mark.filterwarnings("ignore")
+def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(monkeypatch, tmp_path, method, suite):
+    if sys.version_info >= (3, 13) and suite in ("procgen", "dmc"):
+        pytest.skip("no wheels")
+    env_id, n_steps, batch_size = METHOD_ROLLOUTS[suite]
+    short = [f"n_steps:{n_steps}", f"batch_size:{batch_size}", "n_epochs:1"]
+    train(
+        *(monkeypatch, tmp_path, method, env_id, 2 * n_steps),
+        *("--env-kwargs", f"steps_per_task:{n_steps}", "-params", *short),
+    )
+    (path,) = tmp_path.glob(f"{method}/*/*-v?.zip")
+    model = PPO.load(path, device="cpu")
+    assert type(model) is PPO and model.num_timesteps == 2 * n_steps and model._n_updates == 2
+    optimizer = model.policy.optimizer
+    names = {"ppo_trac": "TRAC", "ppo_weight_clipping": "WeightClipping", "ppo_l2_init": "L2Init"}
+    assert type(optimizer).__name__ == names.get(method, "Adam")
+    assert optimizer.param_groups[0]["eps"] == (1e-8 if suite == "gym_control" or method == "ppo_trac" else 1e-5)
+    # Two updates for each task, or those since the reset
+    n_updates = 2 if method in ("ppo_oracle", "ppo_adam_rel") else 4
+    assert {int(optimizer.state[parameter]["step"]) for parameter in model.policy.parameters()} == {n_updates}
+    assert sum(isinstance(module, th.nn.LayerNorm) for module in model.policy.features_extractor.modules()) == (
+        2 if method == "ppo_layer_norm" else 0
+    )
+
+
+def test_oracle_of_minatar_begins_each_game_with_an_empty_buffer(monkeypatch, tmp_path):
+    arguments = ["--env-kwargs", "steps_per_task:100", "-params", "buffer_size:1000"]
+    train(monkeypatch, tmp_path, "double_dqn_oracle", "Continual/MinAtar-v0", 250, *arguments, "--save-replay-buffer")
+    (folder,) = tmp_path.glob("double_dqn_oracle/Continual-MinAtar-v0_1")
+    model = DoubleDQN.load(folder / "Continual-MinAtar-v0.zip", device="cpu")
+    assert (model.trained_task_id, model.double_q, model._n_updates) == (2, True, 0)
+    assert load_from_pkl(folder / "replay_buffer.pkl").size() == 50
+
+
+def test_a_method_by_either_command(tmp_path):
+    """Ours, its ``enjoy``, and the stock one."""
+    arguments = (
+        "--env",
+        "Continual/Acrobot-v1",
+        "-n",
+        "1600",
+        "--env-kwargs",
+        "steps_per_task:800",
+        "-f",
+        "logs",
+        "-tb",
+        "tb",
+    )
+    arguments += ("--eval-freq", "-1", "--num-threads", "1", "--device", "cpu", "--seed", "1", "-params", "n_epochs:1")
+    run("sb3_cchain.zoo", "train", "--algo", "ppo_trac", *arguments, cwd=tmp_path)
+    settings = str(ROOT / "zoo_hyperparams" / "ppo_trac.yml")
+    run("rl_zoo3.train", "--algo", "ppo", "--gym-packages", "sb3_cchain", "-conf", settings, *arguments, cwd=tmp_path)
+    ours, stock = (
+        PPO.load(tmp_path / "logs" / algo / "Continual-Acrobot-v1_1" / "Continual-Acrobot-v1.zip", device="cpu")
+        for algo in ("ppo_trac", "ppo")
+    )
+    assert type(ours.policy.optimizer) is type(stock.policy.optimizer) is baselines.TRAC
+    for name, tensor in ours.policy.state_dict().items():
+        assert th.equal(tensor, stock.policy.state_dict()[name]), name
+    for number in (1, 2):
+        rows = read_returns(tmp_path / "tb" / "Continual-Acrobot-v1" / f"PPO_{number}" / "returns.csv")
+        assert [(row["timesteps"], row["task_id"]) for row in rows] == [(800, 0), (1600, 1)]
+    arguments = ("enjoy", "--algo", "ppo_trac", "--env", "Continual/Acrobot-v1", "-f", "logs", "-n", "401", "--no-render")
+    output = run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path)
+    assert re.search(r"^Mean reward: -\d", output, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("algo", ["ppo_layer_norm", "double_dqn_oracle"])
+def test_a_method_says_which_environments_it_covers(monkeypatch, tmp_path, algo):
+    covered = PROCGEN if algo == "ppo_layer_norm" else SUITES["minatar"]
+    error = f"{algo}.yml has no settings for Continual/Acrobot-v1, only for {', '.join(covered)}. .* -conf FILE$"
+    with pytest.raises(SystemExit, match=error):
+        train(monkeypatch, tmp_path, algo, "Continual/Acrobot-v1", 64)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("option", [[], ["-conf", "mine.yml"]])
+@pytest.mark.parametrize("method", sorted(zoo.METHODS.keys() - zoo_search.GRIDS.keys()))
+def test_a_method_with_nothing_to_search_says_so(monkeypatch, tmp_path, method, option):
+    algo = zoo.METHODS[method]
+    with pytest.raises(SystemExit, match=f"{method} has no hyperparameters of its own to search.* --algo {algo} -optimize"):
+        train(monkeypatch, tmp_path, method, "Continual/Starpilot-v0", 64, "-optimize", *option)
+    assert not list(tmp_path.iterdir())
+
+
+def test_grids_are_the_papers():
+    grids = {method: list(grid.values()) for method, grid in zoo_search.GRIDS.items() if method != "ppo_redo"}
+    assert grids == {"ppo_weight_clipping": [[0.1, 0.5, 1, 10]], "ppo_l2_init": [[0.1, 1, 10, 100, 1000]]}
+    with pytest.raises(ValueError, match=r"`--trial-id`.*'coef': 0.1.*-conf"):
+        zoo_search.HYPERPARAMS_CONVERTER["ppo_l2_init"]({"coef": 0.1})
+
+
+# ReDo's own settings are of ProcGen: others, for the sake of a fast test, in a file
+REDO_FILE = """
+Continual/CartPole-v1:
+  callback:
+    - sb3_cchain.TaskSync
+    - sb3_cchain.baselines.ReDo:
+        batch_size: 16
+  policy: MlpPolicy
+  policy_kwargs: "dict(net_arch=[8], activation_fn=nn.ReLU)"
+  n_timesteps: 64
+"""
+
+
+@pytest.mark.parametrize("method, part", [("ppo_weight_clipping", "WeightClipping"), ("ppo_redo", "ReDo")])
+def test_optimize_keeps_all_else_of_the_settings(monkeypatch, tmp_path, method, part):
+    given = []
+
+    class Spy(getattr(baselines, part)):
+        def __init__(self, *args, **kwargs):
+            given.append(kwargs)
+            super().__init__(*args, **kwargs)
+
+    monkeypatch.setattr(baselines, part, Spy)
+    arguments = ["-optimize", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    if method == "ppo_redo":
+        (tmp_path / "mine.yml").write_text(REDO_FILE)
+        arguments += ["-conf", str(tmp_path / "mine.yml")]
+    arguments += ["-params", "n_steps:64", "n_epochs:1", "batch_size:32"]
+    train(monkeypatch, tmp_path, method, "Continual/CartPole-v1", 64, *arguments)
+    (report,) = tmp_path.glob(f"{method}/report_*.csv")
+    header, *trials = (line.split(",") for line in report.read_text().splitlines())
+    grid = zoo_search.GRIDS[method]
+    tried = [{name: float(trial[header.index(f"params_{name}")]) for name in grid} for trial in trials]
+    assert [trial[header.index("state")] for trial in trials] == ["COMPLETE"] * 3
+    assert all(value in grid[name] for trial in tried for name, value in trial.items())
+    if method == "ppo_redo":
+        assert given == [{"batch_size": 16}, *({"batch_size": 16, **trial} for trial in tried)]
+    else:
+        assert given == [{"lr": 1e-3, "base_kwargs": {"eps": 1e-8, "fused": True}, **trial} for trial in tried]
+
+
+def test_optimize_needs_redo_among_the_callbacks():
+    with pytest.raises(ValueError, match=r"`callback` must have sb3_cchain.baselines.ReDo, got \['sb3_cchain.TaskSync'\]"):
+        zoo_search.with_arguments(["sb3_cchain.TaskSync"], zoo_search.REDO, {"tau": 0.1})
+    assert zoo_search.with_arguments(zoo_search.REDO, zoo_search.REDO, {"tau": 0.1}) == [{zoo_search.REDO: {"tau": 0.1}}]
+
+
+def test_a_file_of_ones_own_for_a_method():
+    arguments = ["--algo", "ppo_redo", "--env", "Continual/CartPole-v1", "-conf", "mine.yml"]
+    assert zoo.with_our_hyperparams(arguments) == arguments
