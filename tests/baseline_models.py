@@ -3,6 +3,7 @@
 from functools import partial
 
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cchain import CChainDQN, CChainPPO, ContinualEnv, DoubleDQN
 from tests.envs import CountEnv, RandomEnv
@@ -33,3 +34,12 @@ def make_random_env():
 
 def parameters(model):
     return {name: parameter.detach().clone() for name, parameter in model.policy.named_parameters()}
+
+
+def go_on(model, callback):
+    """From the same random numbers and the same first observation."""
+    set_random_seed(7)
+    model.env.seed(7)
+    model.action_space.seed(7)
+    model._last_obs = None
+    return model.learn(32, callback=callback, reset_num_timesteps=False)

@@ -8,10 +8,10 @@ import yaml
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.baselines import TRAC, AdamRel, L2Init, OptimizerMetrics, Parseval, WeightClipping
+from tests.baseline_models import go_on
 from tests.envs import RandomEnv
 
 SETTINGS = {
@@ -40,15 +40,6 @@ def make(cls, method):
     settings = SETTINGS[PPO if issubclass(cls, PPO) else DQN]
     policy_kwargs = dict(net_arch=[4, 4], **METHODS[method])
     return cls("MlpPolicy", RandomEnv(), policy_kwargs=policy_kwargs, learning_rate=0.01, seed=0, device="cpu", **settings)
-
-
-def go_on(model):
-    """From the same random numbers and the same first observation."""
-    set_random_seed(7)
-    model.env.seed(7)
-    model.action_space.seed(7)
-    model._last_obs = None
-    return model.learn(32, callback=AdamRel(), reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +71,7 @@ def test_saved_and_loaded_goes_on_as_if_never_stopped(tmp_path, cls, method):
     for other in (loaded, in_place):
         assert other.policy.optimizer.metrics() == model.policy.optimizer.metrics()
     for each in (model, loaded):
-        go_on(each)
+        go_on(each, AdamRel())
     for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True):
         assert th.equal(p, q)
     assert loaded.policy.optimizer.metrics() == model.policy.optimizer.metrics()

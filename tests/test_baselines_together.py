@@ -1,12 +1,28 @@
-"""The baselines that act by callbacks and networks, all at once, with each algorithm."""
+"""The baselines that act by callbacks and networks, all at once, with each algorithm; and all baselines with C-CHAIN."""
 
 import pytest
 import torch as th
 from stable_baselines3 import DQN
 
 from sb3_cchain import TaskSync
-from sb3_cchain.baselines import LayerNormDQNPolicy, LayerNormPolicy, Oracle, ReDo, ShrinkAndPerturb
-from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, make_env, make_model, parameters
+from sb3_cchain.baselines import (
+    TRAC,
+    AdamRel,
+    L2Init,
+    LayerNormDQNPolicy,
+    LayerNormPolicy,
+    OptimizerMetrics,
+    Oracle,
+    ReDo,
+    ShrinkAndPerturb,
+    WeightClipping,
+)
+from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, go_on, make_env, make_model, make_random_env, parameters
+
+NESTED = dict(
+    optimizer_class=TRAC,
+    optimizer_kwargs=dict(s_init=0.1, base_class=L2Init, base_kwargs=dict(coef=0.1, base_class=WeightClipping)),
+)
 
 
 def callbacks():
@@ -42,6 +58,47 @@ def test_train_save_load_and_go_on(tmp_path, name):
 def test_repeats_with_the_seed(name):
     one, other = (make_model(name).learn(2 * STEPS_PER_TASK, callback=callbacks()) for _ in range(2))
     assert all(th.equal(p, q) for p, q in zip(one.policy.parameters(), other.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("everything", [False, True])
+@pytest.mark.parametrize("name", ["CChainPPO", "CChainDQN"])
+def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
+    """ReDo alone, and all that can be together."""
+
+    def callbacks():
+        redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
+        return [redo, ShrinkAndPerturb(shrink=0.999), AdamRel(), OptimizerMetrics()] if everything else [redo]
+
+    layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
+    model = make_model(
+        name,
+        env=make_random_env(),
+        policy=layer_norm if everything else "MlpPolicy",
+        policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU, **(NESTED if everything else {})),
+    )
+    model.learn(48, callback=(first := callbacks()), log_interval=1000)
+    assert first[0].n_recycled > 0
+    keys = {"redo/n_recycled", "churn/loss"}
+    if everything:
+        keys |= {"trac/scale", "l2_init/distance", "weight_clipping/share", "adam_rel/n_resets", "shrink_and_perturb/n_steps"}
+    assert keys <= set(model.logger.name_to_value)
+
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", env=make_random_env(), device="cpu")
+    if isinstance(model, DQN):
+        model.save_replay_buffer(tmp_path / "buffer")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+    before = parameters(model)
+    for each in (model, loaded):
+        go_on(each, callbacks())
+    after, after_loading = parameters(model), parameters(loaded)
+    assert all(th.equal(tensor, after_loading[parameter]) for parameter, tensor in after.items())
+    assert any(not th.equal(tensor, before[parameter]) for parameter, tensor in after.items())
+    # TRAC's scale may have fallen to 0, the moments are of the gradients all the same
+    moments, moments_after_loading = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
+    for parameter in range(len(model.policy.optimizer.param_groups[0]["params"])):
+        assert moments[parameter]["exp_avg"].any()
+        assert all(th.equal(value, moments_after_loading[parameter][key]) for key, value in moments[parameter].items())
 
 
 def test_by_name_from_yaml():
