@@ -16,8 +16,31 @@ from benchmarks.runs import Run
 from benchmarks.suites import Suite, Task
 from sb3_cchain.callbacks.continual_metrics import task_averages
 
-LABELS = {"ppo": "PPO", "ppo_cchain": "C-CHAIN PPO", "double_dqn": "Double DQN", "dqn_cchain": "C-CHAIN DQN"}
-COLORS = {"ppo": "tab:gray", "ppo_cchain": "tab:blue", "double_dqn": "tab:gray", "dqn_cchain": "tab:blue"}
+LABELS = {
+    "ppo_oracle": "Oracle",
+    "double_dqn_oracle": "Oracle",
+    "ppo": "PPO",
+    "double_dqn": "Double DQN",
+    "ppo_trac": "TRAC",
+    "ppo_weight_clipping": "Weight clipping",
+    "ppo_l2_init": "L2 Init",
+    "ppo_layer_norm": "LayerNorm",
+    "ppo_redo": "ReDo",
+    "ppo_adam_rel": "AdamRel",
+    "ppo_cchain": "C-CHAIN PPO",
+    "dqn_cchain": "C-CHAIN DQN",
+}
+COLORS = {
+    **{algo: "tab:brown" for algo in ("ppo_oracle", "double_dqn_oracle")},
+    **{algo: "tab:gray" for algo in ("ppo", "double_dqn")},
+    **{algo: "tab:blue" for algo in ("ppo_cchain", "dqn_cchain")},
+    "ppo_trac": "tab:orange",
+    "ppo_weight_clipping": "tab:green",
+    "ppo_l2_init": "tab:red",
+    "ppo_layer_norm": "tab:purple",
+    "ppo_redo": "tab:pink",
+    "ppo_adam_rel": "tab:olive",
+}
 
 # Which returns of a run: those of training (`Run.returns`), or of evaluation (`Run.evaluations`)
 Returns = Callable[[Run], list[dict[str, float]]]

@@ -1,6 +1,6 @@
 """
-Vanilla and C-CHAIN in an environment of the paper, under the shipped hyperparameters: trains, and writes a table and learning
-curves. The same command goes on where it was interrupted.
+Vanilla, C-CHAIN and the related methods in an environment of the paper, under the shipped hyperparameters: trains, and writes
+a table and learning curves. The same command goes on where it was interrupted.
 
     python -m benchmarks.run --suite gym_control --env Continual/Acrobot-v1 --n-tasks 4 --steps-per-task 64000 --seeds 0 1 2
     python -m benchmarks.run --suite minatar --steps-per-task 100000 --eval-freq 10000 --seeds 0 1
@@ -38,8 +38,8 @@ def main() -> None:
     algos = args.algo or list(suite.algos)
     if env_id not in suite.env_ids:
         parser.error(f"--env must be one of {', '.join(suite.env_ids)}; got {env_id}")
-    if not set(algos) <= set(suite.algos):
-        parser.error(f"--algo must be of {', '.join(suite.algos)}; got {' '.join(algos)}")
+    if not set(algos) <= {*suite.algos, *suite.others}:
+        parser.error(f"--algo must be of {', '.join([*suite.algos, *suite.others])}; got {' '.join(algos)}")
     length = suite.length(env_id)
     n_tasks, steps_per_task = args.n_tasks or length[0], args.steps_per_task or length[1]
     folder = args.output / args.suite / f"{env_id.replace('/', '-')}_{n_tasks}x{steps_per_task}"

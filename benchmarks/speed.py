@@ -22,12 +22,28 @@ from rich.progress import track
 from rich.table import Table
 from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.baselines import (
+    TRAC,
+    AdamRel,
+    CReLU,
+    CReLUPolicy,
+    L2Init,
+    LayerNormPolicy,
+    OptimizerMetrics,
+    OptimizerWrapper,
+    Oracle,
+    Parseval,
+    ReDo,
+    ShrinkAndPerturb,
+    WeightClipping,
+)
 from sb3_cchain.zoo import hyperparams_folder
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
@@ -37,16 +53,27 @@ NOT_THE_MODELS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "mo
 @dataclass
 class Case:
     """
-    Three models under the same settings, the last of which copies its network, and what is timed of each.
+    Models under the same settings, and what is timed of each.
 
     :param title: What it stands for
-    :param models: By name: base, C-CHAIN, deep copy
-    :param measures: By name, calls on a model
+    :param models: By name
+    :param measures: By name, calls on a model, the first of which is ``train()``
+    :param pairs: Names of models whose seconds are divided by each other
     """
 
     title: str
     models: dict[str, Any]
     measures: dict[str, Callable[[Any], Any]]
+    pairs: list[tuple[str, str]]
+
+
+def pairs_of(base: str, ours: str) -> list[tuple[str, str]]:
+    """
+    :param base: Name of the base algorithm
+    :param ours: Name of it with churn reduction
+    :return: The pairs of these two and the loop that copies the network
+    """
+    return [(ours, base), (ours, "deep copy"), ("deep copy", base)]
 
 
 def settings_of(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
@@ -83,6 +110,53 @@ def ppo(env_id: str, **changed: Any) -> Case:
             "train()": lambda model: model.train(),
             "iteration (rollout and train)": lambda model: model.learn(model.n_steps, reset_num_timesteps=False),
         },
+        pairs_of("PPO", "CChainPPO"),
+    )
+
+
+def related() -> Case:
+    """
+    :return: PPO under the Gym Control settings with each of the related methods
+    """
+    settings = settings_of("ppo", "Continual/Acrobot-v1")
+    adam = settings["policy_kwargs"].pop("optimizer_kwargs")
+
+    def make(*callbacks: BaseCallback, algorithm: type[PPO] = PPO, policy: Any = "MlpPolicy", **policy_kwargs: Any) -> Any:
+        policy_kwargs = {"optimizer_kwargs": adam, **settings["policy_kwargs"], **policy_kwargs}
+        return algorithm(**{**settings, "policy": policy, "policy_kwargs": policy_kwargs}), [*callbacks]
+
+    def make_with(optimizer_class: type[OptimizerWrapper], **kwargs: Any) -> Any:
+        optimizer_kwargs = {"base_kwargs": adam, **kwargs}
+        return make(OptimizerMetrics(), optimizer_class=optimizer_class, optimizer_kwargs=optimizer_kwargs)
+
+    # Each with the callbacks that it learns with
+    models = {
+        "PPO": make(),
+        "C-CHAIN": make(algorithm=CChainPPO),
+        "TRAC": make_with(TRAC),
+        "weight clipping": make_with(WeightClipping),
+        "L2 Init": make_with(L2Init),
+        "Parseval": make_with(Parseval, n_output_layers=2),
+        "AdamRel": make(AdamRel()),
+        "Oracle": make(Oracle()),
+        "ReDo every iteration": make(ReDo(interval=1)),
+        "shrink-and-perturb every update": make(ShrinkAndPerturb()),
+        "LayerNorm": make(policy=LayerNormPolicy),
+        "CReLU": make(policy=CReLUPolicy, activation_fn=CReLU),
+    }
+
+    def iteration(made: Any) -> None:
+        model, callbacks = made
+        model.learn(model.n_steps, callback=callbacks, reset_num_timesteps=False)
+
+    for made in models.values():
+        iteration(made)
+        iteration(made)
+    return Case(
+        "Continual/Acrobot-v1, related methods",
+        models,
+        {"train()": lambda made: made[0].train(), "iteration (rollout and train)": iteration},
+        [(name, "PPO") for name in models if name != "PPO"],
     )
 
 
@@ -107,6 +181,7 @@ def minatar(n_past_updates: int = 0) -> Case:
             "100 × train()": lambda model: [model.train(gradient_steps=1, batch_size=32) for _ in range(100)],
             "100 environment steps, an update each": lambda model: model.learn(100, reset_num_timesteps=False),
         },
+        pairs_of("DoubleDQN", "CChainDQN"),
     )
 
 
@@ -115,6 +190,7 @@ CASES: dict[str, Callable[[], Case]] = {
     # A shorter rollout and one epoch of it, as a round would take minutes
     "procgen": partial(ppo, "Continual/Starpilot-v0", n_steps=500, n_epochs=1),
     "dmc": partial(ppo, "Continual/Walker-v0", n_epochs=1),
+    "related": related,
     "minatar": minatar,
     "minatar_later": partial(minatar, n_past_updates=50_000),
 }
@@ -146,7 +222,6 @@ def ratios(case: Case, n_rounds: int) -> Table:
     :param n_rounds: Timings of each
     :return: Ratios of the seconds within a round, and of the operations of the first measure
     """
-    base, ours, copying = case.models
     title = f"{case.title}, {n_rounds} rounds, one thread"
     table = Table("", "ratio", "median", "min", "max", title=title)
     for measure, call in case.measures.items():
@@ -154,12 +229,13 @@ def ratios(case: Case, n_rounds: int) -> Table:
             {name: seconds(partial(call, model)) for name, model in case.models.items()}
             for _ in track(range(n_rounds), description=measure)
         ]
-        for one, other in ((ours, base), (ours, copying), (copying, base)):
+        for one, other in case.pairs:
             figures = [timing[one] / timing[other] for timing in rounds]
             table.add_row(measure, f"{one} / {other}", *(f"{f(figures):.2f}" for f in (np.median, np.min, np.max)))
     train = next(iter(case.measures.values()))
-    needed, of_base = (n_operations(partial(train, case.models[name])) for name in (ours, base))
-    table.caption = f"Floating-point operations of {ours} / {base}: {needed / of_base:.2f}"
+    one, other = case.pairs[0]
+    needed, of_base = (n_operations(partial(train, case.models[name])) for name in (one, other))
+    table.caption = f"Floating-point operations of {one} / {other}: {needed / of_base:.2f}"
     return table
 
 

@@ -23,6 +23,7 @@ class Suite:
     :param env_ids: Its environments
     :param task_name: What a task of an environment is called, by its number
     :param algos: Vanilla and C-CHAIN, by their names on the command line
+    :param others: The methods that the paper compares them with
     :param evaluates: Whether what counts is the return of greedy evaluations, not of training
     :param env_kwargs: Arguments of the environment, as on the command line, for a number of tasks and a seed
     :param own_scales: Whether tasks differ in the size of their returns
@@ -31,6 +32,7 @@ class Suite:
     env_ids: list[str]
     task_name: Callable[[Any, int], str]
     algos: tuple[str, str] = ("ppo", "ppo_cchain")
+    others: tuple[str, ...] = ("ppo_oracle",)
     evaluates: bool = False
     env_kwargs: Callable[[int, int], tuple[str, ...]] = lambda n_tasks, seed: ()
     own_scales: bool = False
@@ -52,7 +54,7 @@ class Suite:
         self, algo: str, env_id: str, seed: int, n_tasks: int, steps_per_task: int, folder: Path, eval_freq: int | None = None
     ) -> Run:
         """
-        :param algo: One of ``algos``
+        :param algo: One of ``algos`` and ``others``
         :param env_id: One of ``env_ids``
         :param seed: Seed of the agent; and of the offsets in Gym Control, where the algorithms meet the same tasks under the
             same seed
@@ -72,6 +74,7 @@ SUITES = {
     "gym_control": Suite(
         [env_id for env_id in ALL_ENVS if env_id.endswith(("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "MountainCar-v0"))],
         lambda env, task: f"task {task}",
+        others=("ppo_oracle", "ppo_trac", "ppo_weight_clipping", "ppo_l2_init"),
         env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}", f"offset_seed:{seed}"),
     ),
     "procgen": Suite(
@@ -81,6 +84,10 @@ SUITES = {
             if "game" in kwargs.get("kwargs", {})
         ],
         lambda env, task: f"level {env.levels[task].start}",
+        others=(
+            *("ppo_oracle", "ppo_trac", "ppo_weight_clipping", "ppo_l2_init"),
+            *("ppo_layer_norm", "ppo_redo", "ppo_adam_rel"),
+        ),
         env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}",),
     ),
     "dmc": Suite(
@@ -92,6 +99,7 @@ SUITES = {
         ["Continual/MinAtar-v0"],
         lambda env, task: env.games[task],
         algos=("double_dqn", "dqn_cchain"),
+        others=("double_dqn_oracle",),
         evaluates=True,
         own_scales=True,
     ),

@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.report import averages_of, cost_table, markdown_table, plot_curves, report, smoothed
+from benchmarks.report import COLORS, LABELS, averages_of, cost_table, markdown_table, plot_curves, report, smoothed
 from benchmarks.runs import DONE, Run, complete
 from benchmarks.suites import ALL_ENVS, SUITES, Task, look_at
+from sb3_cchain.zoo import METHODS
 
 FRAME = np.zeros((20, 30, 3), np.uint8)
 CSV = "timesteps,task_id,n_episodes,mean_return\n"
@@ -61,6 +62,8 @@ def test_evaluations_by_task(tmp_path):
 def test_suites_cover_the_environments():
     assert sorted(env_id for suite in SUITES.values() for env_id in suite.env_ids) == sorted(ALL_ENVS)
     assert {name: len(suite.env_ids) for name, suite in SUITES.items()} == dict(gym_control=4, procgen=16, dmc=3, minatar=1)
+    methods = {algo for suite in SUITES.values() for algo in (*suite.algos, *suite.others)}
+    assert methods == set(LABELS) == set(COLORS) == {"ppo", "ppo_cchain", "double_dqn", "dqn_cchain", *METHODS}
     assert SUITES["gym_control"].length("Continual/MountainCar-v0") == (5, 320_000)
     assert SUITES["minatar"].length("Continual/MinAtar-v0") == (3, 1_500_000)
 
