@@ -79,7 +79,7 @@ def main() -> None:
     console.print(f"{demo.env_id}: {n_tasks} tasks of {steps_per_task} steps. {demo.explanation}")
     complete(runs)
 
-    tasks = [look_at(suite, runs[0], task, draw=args.suite != "gym_control") for task in range(n_tasks)]
+    tasks = [look_at(suite, runs[0], task) for task in range(n_tasks)]
     table = Table("algorithm", "seed", *(task.name for task in tasks), "J(T)", title="Average return per task")
     for run in runs:
         table.add_row(*row_of(run, suite.returns))

@@ -140,7 +140,7 @@ def plot_curves(
     plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
     n_tasks, steps_per_task = runs[0].n_tasks, runs[0].steps_per_task
     task_names = task_names or [f"task {task}" for task in range(n_tasks)]
-    frames_height = 8 / n_tasks * max((frame.shape[0] / frame.shape[1] for frame in frames), default=0)
+    frames_height = min(8 / n_tasks * max((frame.shape[0] / frame.shape[1] for frame in frames), default=0), 2.4)
     figure = plt.figure(figsize=(9, 4.2 + frames_height), layout="constrained")
     grid = figure.add_gridspec(2 if len(frames) else 1, n_tasks, height_ratios=[frames_height, 3.8] if len(frames) else [1])
     for task, frame in enumerate(frames):

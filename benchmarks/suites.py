@@ -1,5 +1,6 @@
 """The suites of the paper: their environments, the algorithms that are compared in them, and what their tasks are."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ class Suite:
     :param evaluates: Whether what counts is the return of greedy evaluations, not of training
     :param env_kwargs: Arguments of the environment, as on the command line, for a number of tasks and a seed
     :param own_scales: Whether tasks differ in the size of their returns
+    :param visible: Whether one sees in a frame what a task is
     """
 
     env_ids: list[str]
@@ -36,6 +38,7 @@ class Suite:
     evaluates: bool = False
     env_kwargs: Callable[[int, int], tuple[str, ...]] = lambda n_tasks, seed: ()
     own_scales: bool = False
+    visible: bool = True
 
     @property
     def returns(self) -> Callable[[Run], list[dict[str, float]]]:
@@ -76,6 +79,7 @@ SUITES = {
         lambda env, task: f"task {task}",
         others=("ppo_oracle", "ppo_trac", "ppo_weight_clipping", "ppo_l2_init"),
         env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}", f"offset_seed:{seed}"),
+        visible=False,
     ),
     "procgen": Suite(
         [
@@ -135,16 +139,15 @@ def make_env(run: Run, task: int, **kwargs: Any) -> gym.Env:
     return gym.make(run.env_id, first_task=task, steps_per_task=10**9, **kwargs)
 
 
-def look_at(suite: Suite, run: Run, task: int, n_episodes: int = 20, draw: bool = False) -> Task:
+def look_at(suite: Suite, run: Run, task: int, n_episodes: int = 20) -> Task:
     """
     :param suite: The run's suite
     :param run: A run
     :param task: Number of one of its tasks
     :param n_episodes: Episodes of random actions
-    :param draw: Whether a frame is wanted: that of the 30th step of the first episode
-    :return: The task
+    :return: The task, with the frame of the 30th step, where the suite is one to see
     """
-    env = make_env(run, task, render_mode="rgb_array" if draw else None)
+    env = make_env(run, task, render_mode="rgb_array" if suite.visible else None)
     assert isinstance(env.unwrapped, ContinualEnv)
     env.action_space.seed(0)
     env.reset(seed=0)
@@ -154,10 +157,18 @@ def look_at(suite: Suite, run: Run, task: int, n_episodes: int = 20, draw: bool 
     while len(returns) < n_episodes:
         *_, terminated, truncated, info = env.step(env.action_space.sample())
         n_steps += 1
-        if draw and n_steps == 30:
-            frame = np.asarray(env.render())
+        if suite.visible and n_steps == 30:
+            frame = _frame(env)
         if terminated or truncated:
             returns.append(info["episode_return"])
             env.reset()
     env.close()
     return Task(suite.task_name(env.unwrapped, task), float(np.mean(returns)), frame)
+
+
+def _frame(env: gym.Env) -> np.ndarray | None:
+    try:
+        return np.asarray(env.render())
+    except Exception as error:  # of whatever graphics library there is or is not; the curves are worth having without
+        warnings.warn(f"No frame of the task can be drawn: {error}")
+        return None
