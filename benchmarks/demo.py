@@ -39,13 +39,14 @@ DEMOS = {
         "Continual/Starpilot-v0",
         3,
         3000,
-        "After each switch it is another level of the same game. Learning takes 100 times longer than this.",
+        "After each switch it is another level of the same game. Learning takes 100 times longer than " "this.",
     ),
     "dmc": Demo(
         "Continual/Walker-v0",
         3,
         16_384,
-        "After each switch the same robot has another goal, which it is told by the rewards alone.",
+        "After each switch the same robot has another goal, which it is told by the rewards alone. At this length C-CHAIN's "
+        "coefficient stays at its warm-up value.",
     ),
     "minatar": Demo(
         "Continual/MinAtar-v0",

@@ -14,6 +14,7 @@ from sb3_cchain import ContinualEnv
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
 ALL_ENVS = [f"Continual/{name}" for name in CONTINUAL_ENVS]
+PROCGEN_ENVS = [f"Continual/{name}" for name, entry in CONTINUAL_ENVS.items() if entry["entry_point"].endswith("Procgen")]
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,12 @@ class Suite:
         :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the
             paper
         :return: The run
+        :raises ValueError: For more tasks than the environment has, or no evaluation in a task
         """
+        if not self.env_kwargs(n_tasks, seed) and n_tasks > self.length(env_id)[0]:
+            raise ValueError(f"`n_tasks` must be at most {self.length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
+        if self.evaluates and not 0 < (eval_freq or steps_per_task // 30) <= steps_per_task:
+            raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
         eval_freq = (eval_freq or steps_per_task // 30) if self.evaluates else -1
         env_kwargs = self.env_kwargs(n_tasks, seed)
         return Run(algo, env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", env_kwargs, eval_freq)
@@ -75,7 +81,7 @@ class Suite:
 
 SUITES = {
     "gym_control": Suite(
-        [env_id for env_id in ALL_ENVS if env_id.endswith(("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "MountainCar-v0"))],
+        ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"],
         lambda env, task: f"task {task}",
         others=("ppo_oracle", "ppo_trac", "ppo_weight_clipping", "ppo_l2_init"),
         env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}", f"offset_seed:{seed}"),
@@ -94,6 +100,7 @@ SUITES = {
         ),
         env_kwargs=lambda n_tasks, seed: (f"n_tasks:{n_tasks}",),
     ),
+    # The paper evaluates with sampled actions and the statistics of the moment, which the episodes of training have, too
     "dmc": Suite(
         ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"],
         lambda env, task: env.task_names[task],

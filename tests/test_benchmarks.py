@@ -68,6 +68,15 @@ def test_suites_cover_the_environments():
     assert SUITES["minatar"].length("Continual/MinAtar-v0") == (3, 1_500_000)
 
 
+def test_runs_that_cannot_be_reported_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"`n_tasks` must be at most 3, the tasks of Continual/Walker-v0; got 5"):
+        SUITES["dmc"].run("ppo", "Continual/Walker-v0", 0, 5, 100, tmp_path)
+    assert SUITES["procgen"].run("ppo", "Continual/Maze-v0", 0, 7, 100, tmp_path).env_kwargs == ("n_tasks:7",)
+    for steps_per_task, eval_freq in ((100, 200), (20, None)):
+        with pytest.raises(ValueError, match=f"between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}"):
+            SUITES["minatar"].run("double_dqn", "Continual/MinAtar-v0", 0, 3, steps_per_task, tmp_path, eval_freq)
+
+
 def test_a_task_without_an_agent(tmp_path):
     suite = SUITES["minatar"]
     task = look_at(suite, suite.run("dqn_cchain", "Continual/MinAtar-v0", 0, 3, 100, tmp_path), 1, n_episodes=300)

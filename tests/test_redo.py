@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -208,6 +209,16 @@ def test_interval_on_policy():
     assert again.recycled_at == [16 * 8]
 
 
+@pytest.mark.parametrize(
+    "name, interval, n_steps, recycled_at", [("PPO", 2, (32, 32), [32, 64]), ("DQN", 5, (13, 5), [5, 10])]
+)
+def test_what_is_due_at_the_end_of_training_is_recycled(name, interval, n_steps, recycled_at):
+    redo, model = SpyReDo(interval=interval), make_model(name)
+    for n_more in n_steps:
+        model.learn(n_more, callback=redo, reset_num_timesteps=False)
+    assert redo.recycled_at == recycled_at
+
+
 def test_interval_off_policy():
     redo = SpyReDo(interval=5)
     model = make_model("DQN").learn(25, callback=redo)
@@ -216,7 +227,7 @@ def test_interval_off_policy():
     assert redo.recycled_at == [5, 10, 15, 20, 25]
     several = SpyReDo(interval=5)
     make_model("DQN", train_freq=4, gradient_steps=4).learn(33, callback=several)
-    assert several.recycled_at == [8, 12, 16, 20]
+    assert several.recycled_at == [8, 12, 16, 20, 28]
 
 
 @pytest.mark.parametrize("name, interval", [("PPO", 10), ("CChainDQN", 1000)])
@@ -240,8 +251,7 @@ def test_batches_are_of_the_latest_rollout(n_envs):
     spy, redo = Observes(), SpyReDo(interval=1, batch_size=5)
     Observes.rollouts = []
     make_model("PPO", env=make_vec_env(make_random_env, n_envs=n_envs)).learn(16 * n_envs * 3, callback=[redo, spy])
-    assert len(redo.batches) == 2
-    for batch, rollout in zip(redo.batches, spy.rollouts, strict=False):
+    for batch, rollout in zip(redo.batches, spy.rollouts, strict=True):
         rows = {tuple(row) for row in batch.tolist()}
         assert len(rows) == 5 and rows <= {tuple(row) for row in rollout.tolist()}
 
@@ -324,8 +334,16 @@ def test_what_it_refuses():
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,), np.float32))
     with pytest.raises(TypeError, match="ReDo is for on-policy algorithms and DQN, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=ReDo())
+    with pytest.raises(TypeError, match="ReDo does not know recurrent networks, got RecurrentPPO"):
+        RecurrentPPO("MlpLstmPolicy", RandomEnv(), n_steps=16, device="cpu").learn(10, callback=ReDo())
     with pytest.raises(ValueError, match="ReDo finds no hidden unit"):
         make_model("PPO", policy_kwargs=dict(net_arch=[])).learn(10, callback=ReDo())
+
+
+def test_of_a_policy_without_gsde():
+    redo = ReDo(tau=1.0, interval=1)
+    MaskablePPO("MlpPolicy", RandomEnv(), n_steps=16, batch_size=8, seed=0, device="cpu").learn(32, callback=redo)
+    assert redo.n_recycled > 0
 
 
 @pytest.mark.parametrize(

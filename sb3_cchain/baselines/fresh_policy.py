@@ -16,8 +16,8 @@ def fresh_policy(model: BaseAlgorithm) -> BasePolicy:
     """
     # As SB3's `_setup_model()` makes it
     policy_kwargs = dict(model.policy_kwargs)
-    if isinstance(model, OnPolicyAlgorithm):
-        policy_kwargs["use_sde"] = model.use_sde
+    if isinstance(model, OnPolicyAlgorithm) and model.use_sde:
+        policy_kwargs["use_sde"] = True
     policy = model.policy_class(model.observation_space, model.action_space, model.lr_schedule, **policy_kwargs)
     return policy.to(model.device)
 

@@ -63,7 +63,7 @@ class ReDo(BaseCallback):
     :param batch_size: Observations that the scores are computed on
     :raises ValueError: Naming the argument that is out of its range; when training starts, for a network in which there is no
         unit that can be recycled
-    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN
+    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, and for recurrent networks
     """
 
     model: OnPolicyAlgorithm | DQN
@@ -81,6 +81,8 @@ class ReDo(BaseCallback):
     def _init_callback(self) -> None:
         if not isinstance(self.model, (OnPolicyAlgorithm, DQN)):
             raise TypeError(f"ReDo is for on-policy algorithms and DQN, got {type(self.model).__name__}")
+        if hasattr(self.model, "_last_lstm_states"):
+            raise TypeError(f"ReDo does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
@@ -109,7 +111,8 @@ class ReDo(BaseCallback):
             self._observations = _rollout_observations(self.model, self.batch_size)
 
     def _on_rollout_start(self) -> None:
-        # train() is over; SB3 has put the policy into evaluation mode
+        # train() is over
+        self.model.policy.set_training_mode(False)
         if isinstance(self.model, DQN) and self._is_due():
             assert self.model.replay_buffer is not None
             replay = self.model.replay_buffer.sample(self.batch_size, env=self.model._vec_normalize_env)
@@ -117,6 +120,9 @@ class ReDo(BaseCallback):
         if self._observations is not None:
             self._recycle(self._observations)
             self._observations = None
+
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()  # what is due now is not left to a learn() to come
 
     def _on_step(self) -> bool:
         return True
