@@ -342,7 +342,7 @@ def test_what_it_refuses():
 
 def test_of_a_policy_without_gsde():
     redo = ReDo(tau=1.0, interval=1)
-    MaskablePPO("MlpPolicy", RandomEnv(), n_steps=16, batch_size=8, seed=0, device="cpu").learn(32, callback=redo)
+    MaskablePPO("MlpPolicy", RandomEnv(), n_steps=16, batch_size=8, seed=0, device="cpu").learn(32, redo, use_masking=False)
     assert redo.n_recycled > 0
 
 

@@ -26,8 +26,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
 
     - the reference batch shares no sample with the minibatch whose update is measured, as the paper demands; the released
       code draws both independently;
-    - the loss that λ is measured by is the mean over an iteration's updates; in DeepMind Control the released code takes that of
-      the last minibatch, which is greater in absolute value;
+    - the loss that λ is measured by is the mean over an iteration's updates; in DeepMind Control the released code takes that
+      of the last minibatch, which is greater in absolute value;
     - the old outputs are computed before the update instead of by a copy of the network after it, with the same result.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
