@@ -163,7 +163,7 @@ def plot_curves(
         if task > 0 and not own_scales:
             axes.axvline(start, color="0.35", linestyle="--", linewidth=1)
         axes.set_xlim(start if own_scales else 0, end)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k" if value else "0")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("return per episode")
     figure.suptitle(title)
@@ -191,7 +191,8 @@ def _draw(axes: Any, runs: Sequence[Run], task: int, returns: Returns, window: i
     grid = np.linspace(max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves), 80)
     mean = np.mean([np.interp(grid, *curve) for curve in curves], axis=0)
     label = LABELS[runs[0].algo] + (f", mean of {len(runs)} seeds" if len(runs) > 1 else "")
-    axes.plot(grid, mean, color=color, linewidth=2.2, label=label)
+    marker = "o" if grid[0] == grid[-1] else None  # a single rollout
+    axes.plot(grid, mean, color=color, linewidth=2.2, marker=marker, label=label)
 
 
 def report(suite: Suite, runs: Sequence[Run], folder: Path, tasks: Sequence[Task]) -> None:
