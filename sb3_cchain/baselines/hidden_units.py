@@ -8,8 +8,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_cchain.analysis.dormancy import mean_activity
 from sb3_cchain.baselines.crelu import CReLU
-from sb3_cchain.baselines.dormancy import mean_activity
 
 _ELEMENTWISE = (
     nn.CELU,
@@ -115,7 +115,7 @@ def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable
     :param network: The network
     :param layers: Its hidden units
     :param run: Calls it on a batch of observations
-    :return: For each layer, :func:`~sb3_cchain.baselines.dormancy.mean_activity` of its units ``(n_units,)``, where the next
+    :return: For each layer, :func:`~sb3_cchain.analysis.dormancy.mean_activity` of its units ``(n_units,)``, where the next
         layers receive them
     """
     modules = {network.get_submodule(name): name for layer in layers for name in layer.outgoing}

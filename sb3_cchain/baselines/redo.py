@@ -4,26 +4,22 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
+from sb3_cchain.analysis.dormancy import dormant_scores
 from sb3_cchain.baselines.churn_reducers import churn_reducers
-from sb3_cchain.baselines.dormancy import dormant_scores
 from sb3_cchain.baselines.fresh_policy import fresh_policy
 from sb3_cchain.baselines.hidden_units import HiddenUnits, find_hidden_units, hidden_activity
+from sb3_cchain.callbacks.training_interval import TrainingInterval
 from sb3_cchain.validation import check_number
 
-DEFAULT_INTERVAL_ON_POLICY = 10
-DEFAULT_INTERVAL_OFF_POLICY = 1000
 
-
-class ReDo(BaseCallback):
+class ReDo(TrainingInterval):
     r"""
     Recycles dormant neurons (ReDo), Sokar et al. (ICML 2023), https://arxiv.org/abs/2302.12902.
 
@@ -69,13 +65,10 @@ class ReDo(BaseCallback):
     model: OnPolicyAlgorithm | DQN
 
     def __init__(self, tau: float = 0.025, interval: int | None = None, batch_size: int = 256):
-        super().__init__()
+        super().__init__(interval, default_on_policy=10, default_off_policy=1000)
         check_number("tau", tau, 0)
-        if interval is not None:
-            check_number("interval", interval, 1, integer=True)
         check_number("batch_size", batch_size, 1, integer=True)
         self.tau = tau
-        self.interval = interval
         self.batch_size = batch_size
 
     def _init_callback(self) -> None:
@@ -85,47 +78,30 @@ class ReDo(BaseCallback):
             raise TypeError(f"ReDo does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        on_policy = isinstance(self.model, OnPolicyAlgorithm)
-        self._interval = self.interval or (DEFAULT_INTERVAL_ON_POLICY if on_policy else DEFAULT_INTERVAL_OFF_POLICY)
+        super()._on_training_start()
         self.n_recycled = 0
         self._observations: PyTorchObs | None = None
-        self._n_trained = self._count()
         self.model.policy.set_training_mode(False)
         self._layers = find_hidden_units(self.model.policy, self._forward(_zeros(self.model)))
         if not self._layers:
             raise ValueError(f"ReDo finds no hidden unit with outgoing weights of its own in {self.model.policy}")
 
-    def _count(self) -> int:
-        """Calls of ``train()``, with the one that is due at the end of a rollout; of DQN the updates."""
-        if isinstance(self.model, OnPolicyAlgorithm):
-            return self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
-        return self.model._n_updates
-
-    def _is_due(self) -> bool:
-        before, self._n_trained = self._n_trained, self._count()
-        return self._n_trained // self._interval > before // self._interval
-
     def _on_rollout_end(self) -> None:
         # The buffer is emptied between train() and the next rollout's start
         if isinstance(self.model, OnPolicyAlgorithm) and self._is_due():
-            self._observations = _rollout_observations(self.model, self.batch_size)
+            self._observations = self._sample_observations(self.batch_size)
 
     def _on_rollout_start(self) -> None:
         # train() is over
         self.model.policy.set_training_mode(False)
         if isinstance(self.model, DQN) and self._is_due():
-            assert self.model.replay_buffer is not None
-            replay = self.model.replay_buffer.sample(self.batch_size, env=self.model._vec_normalize_env)
-            self._observations = replay.observations
+            self._observations = self._sample_observations(self.batch_size)
         if self._observations is not None:
             self._recycle(self._observations)
             self._observations = None
 
     def _on_training_end(self) -> None:
         self._on_rollout_start()  # what is due now is not left to a learn() to come
-
-    def _on_step(self) -> bool:
-        return True
 
     def _forward(self, observations: PyTorchObs) -> Callable[[], Any]:
         if isinstance(self.model, DQN):
@@ -193,12 +169,3 @@ def _zeros(model: OnPolicyAlgorithm | DQN) -> PyTorchObs:
     if isinstance(tensors, dict):
         return {key: th.zeros_like(tensor[:1]) for key, tensor in tensors.items()}
     return th.zeros_like(tensors[:1])
-
-
-def _rollout_observations(model: OnPolicyAlgorithm, batch_size: int) -> PyTorchObs:
-    buffer = model.rollout_buffer
-    n_samples = buffer.buffer_size * buffer.n_envs
-    steps, envs = np.divmod(np.random.permutation(n_samples)[:batch_size], buffer.n_envs)
-    if isinstance(buffer.observations, dict):
-        return obs_as_tensor({key: array[steps, envs] for key, array in buffer.observations.items()}, model.device)
-    return obs_as_tensor(buffer.observations[steps, envs], model.device)
