@@ -1,0 +1,22 @@
+"""Looking at training without changing it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch as th
+
+
+@contextmanager
+def unchanged_random_state() -> Iterator[None]:
+    """
+    What is drawn inside the ``with`` block from the global generators, as replay buffers and networks draw, leaves no trace:
+    training goes on with the numbers that it would have drawn without it.
+    """
+    numpy_state = np.random.get_state()
+    devices = range(th.cuda.device_count()) if th.cuda.is_initialized() else []
+    try:
+        with th.random.fork_rng(devices):
+            yield
+    finally:
+        np.random.set_state(numpy_state)
