@@ -135,9 +135,9 @@ class RecordingPPO(CChainPPO):
             self.trained_on.append({int(x) for x in observations})
             return evaluate_actions(observations, actions)
 
-        def recording_backward(reference):
+        def recording_backward(reference, *args):
             self.measured_on.append({int(x) for x in reference})
-            return backward(reference)
+            return backward(reference, *args)
 
         self.policy.evaluate_actions = recording_evaluate_actions
         self.churn_reducer.backward = recording_backward

@@ -57,19 +57,20 @@ class ChurnReducer(nn.Module):
         self.losses: list[float] = []
         self.compared: list[tuple[th.Tensor, th.Tensor]] = []
 
-    def backward(self, reference: Observations) -> None:
+    def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> None:
         """
         Add the gradient of λ·L_churn, and remember the present outputs on ``reference`` for the next update.
 
         To be called once per update, between ``zero_grad()`` and the optimiser's step.
 
         :param reference: Observations outside the minibatch of the update that is about to be made
+        :param backward: Takes λ·L_churn and adds its gradient
         :raises ValueError: When the churn loss is NaN or infinite. The parameters have not been touched.
         """
         if self.reference is not None:
             with th.enable_grad():
                 loss = self.loss(self._outputs[0](self.reference))
-            loss.backward()
+            backward(loss)
         self.remember(reference)
 
     def loss(self, new_outputs: th.Tensor) -> th.Tensor:

@@ -12,7 +12,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient
+from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, component_backward, extra_gradient
+from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.common.policy_outputs import (
     DEFAULT_TARGET_RATIO,
     as_it_acts,
@@ -81,17 +82,22 @@ class ReferenceBatches:
 BASE_LOSSES = ("actor", "surrogate")
 
 
-def check_base_loss(base_loss: str) -> None:
+def check_choices(churn_base_loss: str, churn_component: str) -> None:
     """
-    :param base_loss: The argument ``churn_base_loss``
+    :param churn_base_loss: The argument
+    :param churn_component: The argument
     :raises ValueError: When it is none that there is
     """
-    if base_loss not in BASE_LOSSES:
-        raise ValueError(f"`churn_base_loss` must be one of {', '.join(map(repr, BASE_LOSSES))}, got {base_loss!r}")
+    for name, value, allowed in (
+        ("churn_base_loss", churn_base_loss, BASE_LOSSES),
+        ("churn_component", churn_component, COMPONENTS),
+    ):
+        if value not in allowed:
+            raise ValueError(f"`{name}` must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 
 @contextmanager
-def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor") -> Iterator[None]:
+def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", component: str = "full") -> Iterator[None]:
     """
     Run ``model``'s own ``train()`` in this block to train it with churn reduction.
 
@@ -110,6 +116,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor") -
     :param model: A PPO model
     :param reducer: Its churn reducer
     :param base_loss: What L is: ``"actor"``, the clipped surrogate and the entropy bonus; ``"surrogate"``, the former alone
+    :param component: Which component of the churn gradient is used: ``"full"``, ``"projection"`` or ``"orthogonal"``
     """
     policy, rollout_buffer = model.policy, model.rollout_buffer
     references = ReferenceBatches(rollout_buffer.get)
@@ -119,16 +126,21 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor") -
     old_values: th.Tensor | None = None
     value_churns: list[float] = []
 
-    def backward() -> None:
+    def backward(add_gradient: Callable[[th.Tensor], Any]) -> None:
         nonlocal old_values
         with acting():
             if old_values is not None:
                 assert reducer.reference is not None
                 value_churns.append((policy_values(policy, reducer.reference) - old_values).abs().mean().item())
-            reducer.backward(references.current)
+            reducer.backward(references.current, add_gradient)
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
-    with replaced(rollout_buffer, "get", references.get), extra_gradient(policy.optimizer, backward):
+    full = component == "full"
+    with (
+        nullcontext(th.Tensor.backward) if full else component_backward(list(policy.parameters()), component) as add_gradient,
+        replaced(rollout_buffer, "get", references.get),
+        extra_gradient(policy.optimizer, lambda: backward(add_gradient)),
+    ):
         yield
 
     if references.overlapping and not reducer.warned_of_overlap:

@@ -7,7 +7,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.task_sync import TaskSwitch
 from sb3_cchain.churn import make_coefficient
-from sb3_cchain.common.on_policy_churn import check_base_loss, make_policy_reducer, reduced_churn
+from sb3_cchain.common.on_policy_churn import check_choices, make_policy_reducer, reduced_churn
 
 
 class CChainCallback(BaseCallback):
@@ -29,6 +29,7 @@ class CChainCallback(BaseCallback):
     :param churn_coef_min: As for ``CChainPPO``
     :param reset_churn_coef: As for ``CChainPPO``
     :param churn_base_loss: As for ``CChainPPO``
+    :param churn_component: As for ``CChainPPO``
     :raises ValueError: Naming the argument that is out of its range
     """
 
@@ -43,6 +44,7 @@ class CChainCallback(BaseCallback):
         churn_coef_min: float = 0.0,
         reset_churn_coef: bool = False,
         churn_base_loss: str = "actor",
+        churn_component: str = "full",
     ):
         super().__init__()
         self._make_coefficient = partial(
@@ -54,8 +56,9 @@ class CChainCallback(BaseCallback):
             minimum=churn_coef_min,
         )
         self._make_coefficient(default_target_ratio=1.0)  # bad values shall fail now
-        check_base_loss(churn_base_loss)
+        check_choices(churn_base_loss, churn_component)
         self.churn_base_loss = churn_base_loss
+        self.churn_component = churn_component
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
         self._reduced_model: PPO | None = None
@@ -82,7 +85,7 @@ class CChainCallback(BaseCallback):
 
         def train_once() -> None:
             vars(self.model).pop("train", None)  # first, so that it is gone when train() fails, too
-            with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss):
+            with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
                 train()
 
         self.model.train = train_once  # type: ignore[method-assign]

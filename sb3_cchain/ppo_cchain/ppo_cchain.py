@@ -7,7 +7,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.common.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.common.on_policy_churn import check_base_loss, make_policy_reducer, reduced_churn
+from sb3_cchain.common.on_policy_churn import check_choices, make_policy_reducer, reduced_churn
 
 SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
 
@@ -45,13 +45,17 @@ class CChainPPO(ChurnAlgorithm, PPO):
         code. C-CHAIN does not need to be told of a switch, hence not by default.
     :param churn_base_loss: ``"actor"``, the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
         or ``"surrogate"``, the former alone, as in its ProcGen
+    :param churn_component: Which component of the churn gradient is used: ``"full"``, or, as the paper's ablation does
+        (Section 5.2), only its ``"projection"`` on PPO's gradient of the actor's parameters or the ``"orthogonal"`` rest.
+        The gradient is clipped after it was added.
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range
     """
 
-    def __init__(self, *args: Any, churn_base_loss: str = "actor", **kwargs: Any):
-        check_base_loss(churn_base_loss)
+    def __init__(self, *args: Any, churn_base_loss: str = "actor", churn_component: str = "full", **kwargs: Any):
+        check_choices(churn_base_loss, churn_component)
         self.churn_base_loss = churn_base_loss
+        self.churn_component = churn_component
         super().__init__(*args, **kwargs)
 
     def _make_churn_reducer(self) -> ChurnReducer:
@@ -62,7 +66,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
         if self.churn_reducer.coefficient.is_zero:
             super().train()
         else:
-            with reduced_churn(self, self.churn_reducer, self.churn_base_loss):
+            with reduced_churn(self, self.churn_reducer, self.churn_base_loss, self.churn_component):
                 super().train()
 
     def learn(
