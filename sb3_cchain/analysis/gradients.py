@@ -1,0 +1,84 @@
+"""The gradients of many minibatches, each apart from the others."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+from torch import nn
+from torch.func import functional_call, grad, vmap
+from torch.utils._pytree import tree_leaves, tree_map
+
+# Maps a minibatch (a tensor, or tensors in tuples and dictionaries) to a scalar that depends on the network's parameters
+Objective = Callable[[Any], th.Tensor]
+
+
+def minibatch_gradients(network: nn.Module, objective: Objective, minibatches: Any, vectorize: bool = True) -> list[th.Tensor]:
+    """
+    Gradient of an objective with respect to the network's parameters, for each minibatch.
+
+    :param network: The network
+    :param objective: Called with one minibatch
+    :param minibatches: As one, with a further dimension in front: ``(n_minibatches, batch_size, ...)``
+    :param vectorize: Whether to compute them together (``torch.func.vmap``) where the objective allows it. It does not where
+        Python decides by the numbers (``if x > 0``), or tensors are changed in place. They are computed one after the other
+        then; the results are equal up to rounding.
+    :return: For each parameter that the objective depends on, ``(n_minibatches, *parameter.shape)``
+    """
+    trained = {name: parameter for name, parameter in network.named_parameters() if parameter.requires_grad}
+    with th.enable_grad():
+        first = th.autograd.grad(objective(_minibatch(minibatches, 0)), list(trained.values()), allow_unused=True)
+    reached = [name for name, gradient in zip(trained, first, strict=True) if gradient is not None]
+    if vectorize:
+        try:
+            return _together(network, objective, minibatches, {name: trained[name].detach() for name in reached})
+        except RuntimeError as error:
+            if "vmap" not in str(error):
+                raise
+    return _one_by_one(objective, minibatches, [trained[name] for name in reached])
+
+
+class _Objective(nn.Module):
+    """The objective as a module's ``forward``, as ``functional_call`` wants it."""
+
+    def __init__(self, network: nn.Module, objective: Objective):
+        super().__init__()
+        self.network = network
+        self.forward = objective
+
+
+def _together(network: nn.Module, objective: Objective, minibatches: Any, parameters: dict[str, th.Tensor]) -> list[th.Tensor]:
+    module = _Objective(network, objective)
+
+    def value(parameters: dict[str, th.Tensor], minibatch: Any) -> th.Tensor:
+        return functional_call(module, {f"network.{name}": tensor for name, tensor in parameters.items()}, (minibatch,))
+
+    with _unvalidated_distributions():
+        gradients = vmap(grad(value), in_dims=(None, 0))(parameters, minibatches)
+    return list(gradients.values())
+
+
+def _one_by_one(objective: Objective, minibatches: Any, parameters: list[nn.Parameter]) -> list[th.Tensor]:
+    n_minibatches = len(tree_leaves(minibatches)[0])
+    gradients = [parameter.new_empty(n_minibatches, *parameter.shape) for parameter in parameters]
+    for index in range(n_minibatches):
+        with th.enable_grad():
+            value = objective(_minibatch(minibatches, index))
+        for of_all, gradient in zip(gradients, th.autograd.grad(value, parameters), strict=True):
+            of_all[index] = gradient
+    return gradients
+
+
+def _minibatch(minibatches: Any, index: int) -> Any:
+    return tree_map(lambda tensor: tensor[index], minibatches)
+
+
+@contextmanager
+def _unvalidated_distributions() -> Iterator[None]:
+    """``torch.distributions`` looks at its arguments with an ``if``, which ``vmap`` does not allow."""
+    validate = th.distributions.Distribution._validate_args
+    th.distributions.Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        th.distributions.Distribution.set_default_validate_args(validate)

@@ -1,0 +1,147 @@
+"""The empirical neural tangent kernel (NTK) of a policy or a Q-network."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import obs_as_tensor
+from torch import nn
+
+from sb3_cchain.analysis.gradients import Objective, minibatch_gradients
+from sb3_cchain.analysis.rank import condition_number, effective_rank, singular_values, srank
+
+
+def gram_matrix(gradients: Sequence[th.Tensor]) -> th.Tensor:
+    r"""
+    :math:`N(i, j) = g_i^\top g_j`, in double precision.
+
+    :param gradients: For each parameter ``(n, *parameter.shape)``: its part of :math:`g_1, \dots, g_n`
+    :return: ``(n, n)``
+    """
+    flat = [gradient.flatten(start_dim=1).double() for gradient in gradients]
+    return th.stack([part @ part.T for part in flat]).sum(dim=0)
+
+
+def off_diagonal_sum(matrix: th.Tensor) -> float:
+    """
+    :param matrix: A square matrix
+    :return: Sum of the absolute values off the diagonal: for an NTK, how much the gradients of minibatches have in common
+    """
+    return (matrix.abs().sum() - matrix.diagonal().abs().sum()).item()
+
+
+def diagonal_sum(matrix: th.Tensor) -> float:
+    """
+    :param matrix: A square matrix
+    :return: Sum of the absolute values on the diagonal: for an NTK, of the squared norms of the gradients
+    """
+    return matrix.diagonal().abs().sum().item()
+
+
+def ntk_statistics(matrix: th.Tensor, delta: float = 0.01) -> dict[str, float]:
+    """
+    :param matrix: An NTK
+    :param delta: δ of :func:`~sb3_cchain.analysis.rank.srank`
+    :return: ``srank``, ``effective_rank``, ``off_diagonal_sum``, ``diagonal_sum`` and ``condition_number``
+    """
+    values = singular_values(matrix)
+    return {
+        "srank": srank(values, delta),
+        "effective_rank": effective_rank(values),
+        "off_diagonal_sum": off_diagonal_sum(matrix),
+        "diagonal_sum": diagonal_sum(matrix),
+        "condition_number": condition_number(values),
+    }
+
+
+def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
+    r"""
+    The empirical NTK of a policy, Appendix B of the C-CHAIN paper: the rollout is divided at random into minibatches of equal
+    size, and :math:`N(i, j) = g_i^\top g_j` with the gradient :math:`g_i` of the policy objective on minibatch :math:`i`,
+
+    .. math:: \frac{1}{|B_i|} \sum_{(s, a) \in B_i} \frac{\pi_\theta(a|s)}{\pi_{old}(a|s)} \hat A(s, a),
+
+    with respect to the policy's parameters. To be called when the rollout is complete and ``train()`` has not begun: θ are
+    the parameters that it was collected with, so nothing is clipped yet, the gradients of PPO, of its surrogate and of A2C are
+    the same, and it is computed as that of :math:`\log \pi_\theta(a|s)\, \hat A(s, a)`. There is no entropy bonus in it. The
+    advantages are normalised over the rollout to mean 0 and standard deviation 1, whatever the algorithm does: so their scale
+    is no part of what is compared between tasks.
+
+    The global NumPy generator draws the division.
+
+    :param model: A model with a complete rollout
+    :param n_minibatches: m, the size of the matrix; it is the rollout's size where that is smaller
+    :return: ``(m, m)``
+    """
+    buffer, policy = model.rollout_buffer, model.policy
+    n_samples = buffer.buffer_size * buffer.n_envs
+    n_minibatches = min(n_minibatches, n_samples)
+    indices = np.random.permutation(n_samples)[: n_samples // n_minibatches * n_minibatches].reshape(n_minibatches, -1)
+
+    def minibatches_of(array: Any) -> Any:
+        """``(n_steps, n_envs, ...)`` to ``(n_minibatches, batch_size, ...)``"""
+        if isinstance(array, dict):
+            return {key: minibatches_of(of_key) for key, of_key in array.items()}
+        return obs_as_tensor(array[np.divmod(indices, buffer.n_envs)], model.device)
+
+    advantages = minibatches_of((buffer.advantages - buffer.advantages.mean()) / (buffer.advantages.std() + 1e-8))
+    actions = minibatches_of(buffer.actions)
+    if isinstance(model.action_space, spaces.Discrete):
+        actions = actions.long().flatten(start_dim=1)
+    minibatches: tuple[Any, ...] = (minibatches_of(buffer.observations), actions, advantages)
+    if hasattr(buffer, "action_masks"):  # of sb3-contrib's MaskablePPO
+        minibatches += (minibatches_of(buffer.action_masks.reshape(*buffer.advantages.shape, -1)),)
+
+    def objective(minibatch: tuple[Any, ...]) -> th.Tensor:
+        observations, actions, advantages, *masks = minibatch
+        _, log_prob, _ = policy.evaluate_actions(observations, actions, *masks)
+        return (log_prob * advantages).mean()
+
+    return _ntk(policy, objective, minibatches)
+
+
+def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
+    r"""
+    The empirical NTK of a Q-network, by its definition (Eq. 2 of the C-CHAIN paper) on transitions of the replay buffer:
+    :math:`N(i, j) = \nabla_\theta Q_\theta(s_i, a_i)^\top \nabla_\theta Q_\theta(s_j, a_j)`.
+
+    :param model: A model whose replay buffer is not empty
+    :param n_transitions: m, the size of the matrix
+    :return: ``(m, m)``
+    """
+    assert model.replay_buffer is not None
+    replay = model.replay_buffer.sample(n_transitions, env=model._vec_normalize_env)
+    # QRDQN's values are the means of quantiles
+    quantile_net = getattr(model, "quantile_net", None)
+
+    def q_values(observations: Any) -> th.Tensor:
+        return model.q_net(observations) if quantile_net is None else quantile_net(observations).mean(dim=1)
+
+    def objective(minibatch: Any) -> th.Tensor:
+        observations, actions = minibatch
+        return q_values(observations).gather(1, actions).mean()
+
+    observations = replay.observations
+    if isinstance(observations, dict):
+        observations = {key: tensor[:, None] for key, tensor in observations.items()}
+    else:
+        observations = observations[:, None]
+    return _ntk(quantile_net or model.q_net, objective, (observations, replay.actions.long()[:, None]))
+
+
+def _ntk(network: nn.Module, objective: Objective, minibatches: Any) -> th.Tensor:
+    network.train(False)  # as in the rollout; train() switches the mode by itself
+    # Vectorised convolutions take more memory and time than one minibatch after the other
+    vectorize = not any(isinstance(module, nn.modules.conv._ConvNd) for module in network.modules())
+    # A policy keeps its last distribution, which shall not be one of vmap's tensors
+    distribution = getattr(network, "action_dist", None)
+    before = dict(vars(distribution)) if distribution is not None else {}
+    try:
+        return gram_matrix(minibatch_gradients(network, objective, minibatches, vectorize))
+    finally:
+        if distribution is not None:
+            vars(distribution).update(before)

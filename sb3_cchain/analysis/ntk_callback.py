@@ -1,0 +1,117 @@
+"""Logs the neural tangent kernel during training."""
+
+from pathlib import Path
+
+import torch as th
+from matplotlib.figure import Figure as MatplotlibFigure
+from stable_baselines3 import DQN
+from stable_baselines3.common.logger import Figure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.analysis.ntk import ntk_statistics, policy_ntk, q_ntk
+from sb3_cchain.callbacks.random_state import unchanged_random_state
+from sb3_cchain.callbacks.training_interval import TrainingInterval
+from sb3_cchain.validation import check_number
+
+
+class NTKCallback(TrainingInterval):
+    r"""
+    Logs the empirical neural tangent kernel (NTK), Section 5.2 and Appendix B of the C-CHAIN paper
+    (https://arxiv.org/abs/2506.00592), whose rank falls, by the paper, as plasticity is lost: of the policy over m minibatches
+    of each rollout with on-policy algorithms (:func:`~sb3_cchain.analysis.ntk.policy_ntk`), of the action values over m
+    transitions of the replay buffer with DQN (:func:`~sb3_cchain.analysis.ntk.q_ntk`).
+
+    Logged, of the matrix :math:`N` of size m:
+
+    - ``ntk/srank``: the least number of singular values that hold 1 − δ of their sum
+      (:func:`~sb3_cchain.analysis.rank.srank`), the paper's "approximate rank"
+    - ``ntk/effective_rank``: the exponential of the entropy of their shares of the sum
+      (:func:`~sb3_cchain.analysis.rank.effective_rank`)
+    - ``ntk/off_diagonal_sum``, ``ntk/diagonal_sum``: sums of :math:`|N(i, j)|` off and on the diagonal
+    - ``ntk/condition_number``: greatest by least singular value
+    - ``ntk/matrix``: a picture of the matrix, in TensorBoard; the same as a PNG file
+
+    The paper's are m = 100 and δ = 0.01, at every iteration.
+
+    Training is the same with and without it. It costs m forward and backward passes of a minibatch, vectorised where there
+    are no convolutions, and m times the memory of the parameters.
+
+    :param n_minibatches: m, the size of the matrix; it is the rollout's size where that is smaller
+    :param delta: δ
+    :param interval: Between two matrices: calls of ``train()`` for on-policy algorithms, gradient updates for DQN; None for 1
+        and 1000
+    :param picture_interval: Matrices from one picture to the next, beginning with the first; 0 for no pictures
+    :param path: Folder of the PNG files; by default ``ntk`` in the folder of the logs, if the model has ``tensorboard_log`` or
+        was given a logger by ``set_logger()``
+    :raises ValueError: Naming the argument that is out of its range
+    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, and for recurrent policies
+    """
+
+    model: OnPolicyAlgorithm | DQN
+
+    def __init__(
+        self,
+        n_minibatches: int = 100,
+        delta: float = 0.01,
+        interval: int | None = None,
+        picture_interval: int = 50,
+        path: str | Path | None = None,
+    ):
+        super().__init__(interval, default_on_policy=1, default_off_policy=1000)
+        check_number("n_minibatches", n_minibatches, 2, integer=True)
+        check_number("delta", delta, 0, 1)
+        check_number("picture_interval", picture_interval, 0, integer=True)
+        self.n_minibatches = n_minibatches
+        self.delta = delta
+        self.picture_interval = picture_interval
+        self.path = None if path is None else Path(path)
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, (OnPolicyAlgorithm, DQN)) and not hasattr(self.model, "quantile_net"):
+            raise TypeError(f"NTKCallback is for on-policy algorithms and DQN, got {type(self.model).__name__}")
+        if hasattr(self.model, "_last_lstm_states"):
+            raise TypeError(f"NTKCallback does not know recurrent networks, got {type(self.model).__name__}")
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._n_matrices = 0
+        # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
+        has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
+        folder = self.logger.get_dir() if has_folder else None
+        self._folder = self.path or (Path(folder) / "ntk" if folder is not None else None)
+
+    def _on_rollout_end(self) -> None:
+        if not self._is_due():
+            return
+        with unchanged_random_state():
+            if isinstance(self.model, OnPolicyAlgorithm):
+                matrix = policy_ntk(self.model, self.n_minibatches)
+            else:
+                matrix = q_ntk(self.model, self.n_minibatches)
+        for name, value in ntk_statistics(matrix, self.delta).items():
+            self.logger.record(f"ntk/{name}", value)
+        if self.picture_interval and self._n_matrices % self.picture_interval == 0:
+            figure = plot_ntk(matrix, f"NTK at step {self.num_timesteps}")
+            self.logger.record("ntk/matrix", Figure(figure, close=False), exclude=("stdout", "log", "json", "csv"))
+            if self._folder is not None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                figure.savefig(self._folder / f"ntk_{self.num_timesteps}.png")
+        self._n_matrices += 1
+
+
+def plot_ntk(matrix: th.Tensor, title: str) -> MatplotlibFigure:
+    """
+    :param matrix: An NTK
+    :param title: Title
+    :return: The matrix as a picture: red above 0, blue below, white 0. The 1 % of entries of the greatest size are beyond the
+        ends of the colours, or a few of them would leave everything else white.
+    """
+    figure = MatplotlibFigure(figsize=(4.6, 4), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    limit = matrix.abs().quantile(0.99).item()
+    image = axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    axes.set_title(title)
+    axes.set_xlabel("minibatch")
+    axes.set_ylabel("minibatch")
+    figure.colorbar(image, extend="both", label="inner product of gradients")
+    return figure

@@ -1,0 +1,236 @@
+"""The empirical neural tangent kernel: the matrix, its statistics, and the callback that logs them."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3.common.logger import configure
+from torch import nn
+
+from sb3_cchain import CChainDQN, CChainPPO
+from sb3_cchain.analysis import NTKCallback
+from sb3_cchain.analysis.gradients import minibatch_gradients
+from sb3_cchain.analysis.ntk import diagonal_sum, gram_matrix, ntk_statistics, off_diagonal_sum, policy_ntk, q_ntk
+from tests.envs import RandomEnv
+
+KEYS = ["condition_number", "diagonal_sum", "effective_rank", "off_diagonal_sum", "srank"]
+
+
+def test_matrix_and_sums_by_hand():
+    # Gradients (1, 2, 0), (0, 1, -1), (0, 0, 3) of two parameters, of one and of two entries
+    gradients = [th.tensor([[1.0], [0.0], [0.0]]), th.tensor([[2.0, 0.0], [1.0, -1.0], [0.0, 3.0]])]
+    matrix = gram_matrix(gradients)
+    assert matrix.tolist() == [[5.0, 2.0, 0.0], [2.0, 2.0, -3.0], [0.0, -3.0, 9.0]]
+    assert matrix.dtype == th.float64
+    assert off_diagonal_sum(matrix) == 10.0
+    assert diagonal_sum(matrix) == 16.0
+
+
+def test_statistics_by_hand():
+    # Eigenvalues 3 and 1
+    matrix = th.tensor([[2.0, -1.0], [-1.0, 2.0]], dtype=th.float64)
+    statistics = ntk_statistics(matrix)
+    assert sorted(statistics) == KEYS
+    assert statistics["srank"] == 2
+    assert ntk_statistics(matrix, delta=0.3)["srank"] == 1
+    assert statistics["effective_rank"] == pytest.approx(math.exp(-0.75 * math.log(0.75) - 0.25 * math.log(0.25)))
+    assert statistics["condition_number"] == pytest.approx(3.0)
+    assert statistics["off_diagonal_sum"] == 2.0
+    assert statistics["diagonal_sum"] == 4.0
+
+
+class Scale(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.factor = nn.Parameter(th.tensor([2.0, -1.0]))
+        self.unused = nn.Parameter(th.ones(3))
+        self.frozen = nn.Parameter(th.ones(2), requires_grad=False)
+
+
+@pytest.mark.parametrize("vectorize", [True, False])
+def test_gradients_by_hand(vectorize):
+    network = Scale()
+
+    def objective(minibatch):  # mean of (factor · x)², whose gradient is the mean of 2 (factor · x) x
+        return (minibatch["x"] @ network.factor).square().mean() + network.frozen.sum()
+
+    minibatches = {"x": th.tensor([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]]])}
+    (gradients,) = minibatch_gradients(network, objective, minibatches, vectorize)
+    assert gradients.tolist() == [[2.0, -1.0], [2.0, 2.0]]
+    assert network.factor.grad is None
+
+
+def test_one_by_one_where_the_objective_cannot_be_vectorised():
+    network, calls = Scale(), []
+
+    def objective(minibatch):
+        calls.append(len(minibatch))
+        return network.factor.sum() * minibatch.sum() if minibatch.sum() > 0 else -network.factor.sum()
+
+    (gradients,) = minibatch_gradients(network, objective, th.tensor([[1.0], [3.0], [-1.0]]))
+    assert gradients.tolist() == [[1.0, 1.0], [3.0, 3.0], [-1.0, -1.0]]
+    assert len(calls) > 3
+
+
+def test_errors_of_the_objective_are_not_taken_for_a_lack_of_vectorisation():
+    network = Scale()
+    with pytest.raises(RuntimeError, match="size"):
+        minibatch_gradients(network, lambda x: (network.factor * x).sum(), th.ones(3, 5))
+
+
+def rollout(model):
+    """A model with a complete rollout, as it is when the callbacks' ``on_rollout_end`` is called."""
+    model.learn(0)
+    _, callback = model._setup_learn(model.n_steps)
+    model.collect_rollouts(model.env, callback, model.rollout_buffer, n_rollout_steps=model.n_steps)
+    return model
+
+
+IMAGES = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+ENVS = {
+    "discrete": "CartPole-v1",
+    "box": "Pendulum-v1",
+    "image": lambda: RandomEnv(IMAGES),
+    "dict": lambda: RandomEnv(spaces.Dict({"a": spaces.Box(-1, 1, (3,)), "b": spaces.Discrete(4)})),
+}
+
+
+def make_ppo(env, algorithm=PPO, **kwargs):
+    env = ENVS[env]
+    if callable(env):
+        env = env()
+    policy = "MlpPolicy"
+    if not isinstance(env, str):
+        policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "CnnPolicy"
+    return algorithm(policy, env, n_steps=24, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu", **kwargs)
+
+
+@pytest.mark.parametrize("env", list(ENVS))
+@pytest.mark.parametrize("algorithm", [PPO, A2C, CChainPPO])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_policy_ntk_is_that_of_the_clipped_surrogate(env, algorithm, monkeypatch):
+    """Against a loop over the loss as PPO writes it, with the gradients in one vector each."""
+    model = rollout(make_ppo(env, algorithm))
+    order = np.random.default_rng(0).permutation(24)
+    monkeypatch.setattr(np.random, "permutation", lambda n: order)
+    matrix = policy_ntk(model, n_minibatches=8)
+
+    buffer, policy = model.rollout_buffer, model.policy
+    normalized = (buffer.advantages - buffer.advantages.mean()) / (buffer.advantages.std() + 1e-8)
+    vectors = []
+    for indices in order.reshape(8, 3):
+        if isinstance(buffer.observations, dict):
+            observations = {key: th.as_tensor(array[indices, 0]) for key, array in buffer.observations.items()}
+        else:
+            observations = th.as_tensor(buffer.observations[indices, 0])
+        actions = th.as_tensor(buffer.actions[indices, 0])
+        if isinstance(model.action_space, spaces.Discrete):
+            actions = actions.long().flatten()
+        advantages, old = th.as_tensor(normalized[indices, 0]), th.as_tensor(buffer.log_probs[indices, 0])
+        ratio = (policy.evaluate_actions(observations, actions)[1] - old).exp()
+        loss = -th.min(advantages * ratio, advantages * ratio.clamp(0.8, 1.2)).mean()
+        gradients = th.autograd.grad(loss, list(policy.parameters()), allow_unused=True)
+        vectors.append(th.cat([g.flatten() for g in gradients if g is not None]).double())
+    expected = th.stack([th.stack([a @ b for b in vectors]) for a in vectors])
+    assert expected.abs().max() > 0
+    th.testing.assert_close(matrix, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
+
+
+def test_vectorised_and_one_by_one_are_equal(monkeypatch):
+    model = rollout(make_ppo("discrete"))
+    order = np.random.default_rng(0).permutation(24)
+    monkeypatch.setattr(np.random, "permutation", lambda n: order)
+    together = policy_ntk(model)
+    apart = minibatch_gradients
+    monkeypatch.setattr("sb3_cchain.analysis.ntk.minibatch_gradients", lambda n, o, m, vectorize: apart(n, o, m, False))
+    one_by_one = policy_ntk(model)
+    assert together.shape == (24, 24)  # a rollout of 24 steps has no 100 minibatches
+    th.testing.assert_close(together, one_by_one, rtol=1e-5, atol=1e-5 * together.abs().max().item())
+
+
+def test_small_policies_are_vectorised(monkeypatch):
+    model = rollout(make_ppo("discrete"))
+    monkeypatch.setattr("sb3_cchain.analysis.gradients._one_by_one", lambda *args: pytest.fail("not vectorised"))
+    policy_ntk(model)
+    model.policy.action_dist.distribution.sample()  # not one of vmap's tensors
+
+
+def test_q_ntk_is_that_of_the_definition():
+    model = DQN("MlpPolicy", "CartPole-v1", learning_starts=10, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu").learn(
+        40
+    )
+    np.random.seed(3)
+    matrix = q_ntk(model, 7)
+    np.random.seed(3)
+    replay = model.replay_buffer.sample(7)
+    vectors = []
+    for observation, action in zip(replay.observations, replay.actions, strict=True):
+        value = model.q_net(observation[None])[0, action.item()]
+        vectors.append(th.cat([g.flatten() for g in th.autograd.grad(value, list(model.q_net.parameters()))]).double())
+    expected = th.stack([th.stack([a @ b for b in vectors]) for a in vectors])
+    th.testing.assert_close(matrix, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, CChainPPO, DQN, CChainDQN])
+def test_callback_logs_and_leaves_training_as_it_is(algorithm, tmp_path):
+    off_policy = issubclass(algorithm, DQN)
+    settings = dict(learning_starts=20, train_freq=1) if off_policy else dict(n_steps=32)
+    if issubclass(algorithm, PPO):
+        settings["batch_size"] = 16
+    settings.update(policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu")
+    model = algorithm("MlpPolicy", "CartPole-v1", **settings)
+    model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+    logged = []
+    callback = NTKCallback(n_minibatches=6, interval=25 if off_policy else 2, picture_interval=2)
+    record = model.logger.record
+    model.logger.record = lambda key, value, exclude=None: (logged.append(key), record(key, value, exclude))
+    model.learn(128, callback=callback)
+    del model.logger.record
+    assert [logged.count(f"ntk/{key}") for key in KEYS] == [4 if off_policy else 2] * 5
+    pictures = sorted(path.name for path in (tmp_path / "ntk").iterdir())
+    assert len(pictures) == logged.count("ntk/matrix") == (2 if off_policy else 1), pictures
+
+    plain = algorithm("MlpPolicy", "CartPole-v1", **settings).learn(128)
+    for name, parameter in plain.policy.named_parameters():
+        assert th.equal(parameter, model.policy.get_parameter(name)), name
+    model.save(tmp_path / "model")
+
+
+def test_no_files_without_a_folder_of_logs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_ppo("discrete").learn(24, callback=NTKCallback(n_minibatches=4))
+    assert not list(tmp_path.iterdir())
+    make_ppo("discrete").learn(24, callback=NTKCallback(n_minibatches=4, path="pictures"))
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["ntk_24.png"]
+
+
+@pytest.mark.parametrize("argument, value", [("n_minibatches", 1), ("delta", 1.5), ("interval", 0), ("picture_interval", -1)])
+def test_bad_arguments(argument, value):
+    with pytest.raises(ValueError, match=f"`{argument}` must be .*got {value}"):
+        NTKCallback(**{argument: value})
+
+
+def test_unknown_algorithms():
+    with pytest.raises(TypeError, match="on-policy algorithms and DQN, got SAC"):
+        SAC("MlpPolicy", "Pendulum-v1", device="cpu").learn(10, callback=NTKCallback())
+
+
+def test_sb3_contrib():
+    contrib = pytest.importorskip("sb3_contrib")
+    kwargs = dict(policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu")
+    model = contrib.QRDQN("MlpPolicy", "CartPole-v1", learning_starts=10, **kwargs)
+    model.learn(40, callback=NTKCallback(n_minibatches=5, interval=5))
+    assert model.logger.name_to_value["ntk/srank"] >= 1
+    model = contrib.TRPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, **kwargs)
+    model.learn(32, callback=NTKCallback(n_minibatches=5))
+    env = gym.wrappers.TransformObservation(gym.make("CartPole-v1"), lambda x: x, None)
+    env.action_masks = lambda: np.array([True, True])
+    model = contrib.MaskablePPO("MlpPolicy", env, n_steps=32, batch_size=16, **kwargs)
+    model.learn(32, callback=NTKCallback(n_minibatches=5))
+    model = contrib.RecurrentPPO("MlpLstmPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
+    with pytest.raises(TypeError, match="recurrent"):
+        model.learn(32, callback=NTKCallback(n_minibatches=5))
