@@ -39,6 +39,7 @@ class Run:
     :param folder: Where the run's files go
     :param env_kwargs: Further arguments of the environment, as on the command line
     :param eval_freq: Environment steps between two evaluations (ten greedy episodes of the task being trained), or -1
+    :param hyperparams: What differs from the shipped hyperparameters, as on the command line
     """
 
     algo: str
@@ -49,6 +50,7 @@ class Run:
     folder: Path
     env_kwargs: tuple[str, ...] = ()
     eval_freq: int = -1
+    hyperparams: tuple[str, ...] = ()
 
     @property
     def total_steps(self) -> int:
@@ -69,6 +71,7 @@ class Run:
             *("--eval-freq", str(self.eval_freq), "--eval-episodes", "10"),
             *("--log-folder", str(self.folder), "--tensorboard-log", str(self.folder / "tensorboard"), "--verbose", "0"),
             *("--env-kwargs", f"steps_per_task:{self.steps_per_task}", *self.env_kwargs),
+            *(("--hyperparams", *self.hyperparams) if self.hyperparams else ()),
         ]
 
     @property
@@ -80,10 +83,10 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """What determines the run: its hyperparameters and versions."""
-        hyperparameters = yaml.safe_load((hyperparams_folder() / f"{self.algo}.yml").read_text())
+        arguments = [self.env_id, self.seed, self.n_tasks, self.steps_per_task, self.eval_freq]
         return {
-            "arguments": [self.env_id, self.seed, self.n_tasks, self.steps_per_task, self.eval_freq, *self.env_kwargs],
-            "hyperparameters": hyperparameters.get(self.env_id),
+            "arguments": [*arguments, *self.env_kwargs, *self.hyperparams],
+            "hyperparameters": shipped_hyperparameters(self.algo, self.env_id),
             "versions": {name: version(name) for name in ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")},
         }
 
@@ -131,6 +134,15 @@ class Run:
             }
             for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
         ]
+
+
+def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
+    """
+    :param algo: Name of the algorithm on the command line
+    :param env_id: Environment id
+    :return: What our YAML file says of it, if anything
+    """
+    return yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text()).get(env_id)
 
 
 def _peak_memory(pid: int) -> int | None:
