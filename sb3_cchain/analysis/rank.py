@@ -9,7 +9,8 @@ from sb3_cchain.validation import check_number
 
 def singular_values(matrix: th.Tensor) -> th.Tensor:
     r"""
-    :math:`\sigma_1 \ge \sigma_2 \ge \dots \ge 0`, computed in double precision whatever the matrix has.
+    :math:`\sigma_1 \ge \sigma_2 \ge \dots \ge 0`, computed in double precision and on the CPU, whatever the matrix has and
+    wherever it is.
 
     :param matrix: ``(n_rows, n_columns)``
     :return: ``(min(n_rows, n_columns),)``, the greatest first, without gradient
@@ -17,7 +18,7 @@ def singular_values(matrix: th.Tensor) -> th.Tensor:
     """
     if not matrix.isfinite().all():
         raise ValueError("`matrix` must be finite, got entries that are infinite or not a number")
-    return th.linalg.svdvals(matrix.detach().double())
+    return th.linalg.svdvals(matrix.detach().to("cpu", th.float64))
 
 
 def srank(singular_values: th.Tensor, delta: float = 0.01) -> int:

@@ -1,7 +1,6 @@
 """Which weights lead into and out of each hidden unit of a network."""
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,24 +9,8 @@ from torch import nn
 
 from sb3_cchain.analysis.dormancy import mean_activity
 from sb3_cchain.baselines.crelu import CReLU
-
-_ELEMENTWISE = (
-    nn.CELU,
-    nn.Dropout,
-    nn.ELU,
-    nn.GELU,
-    nn.Hardswish,
-    nn.Hardtanh,
-    nn.LeakyReLU,
-    nn.Mish,
-    nn.ReLU,
-    nn.ReLU6,
-    nn.SELU,
-    nn.Sigmoid,
-    nn.SiLU,
-    nn.Softplus,
-    nn.Tanh,
-)
+from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS
+from sb3_cchain.common.forward_hooks import forward_hooks
 
 
 @dataclass
@@ -83,9 +66,9 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
             return th.cat([inputs[0], inputs[0]], dim=1)
         if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
             arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
-        return inputs[0] if isinstance(module, (*_ELEMENTWISE, nn.LayerNorm)) else None
+        return inputs[0] if isinstance(module, (*ELEMENTWISE_ACTIVATIONS, nn.Dropout, nn.LayerNorm)) else None
 
-    with _forward_hooks(names, send_tags), th.enable_grad():
+    with forward_hooks(names, send_tags), th.enable_grad():
         run()
 
     all_tags = th.cat(tags).detach()
@@ -124,7 +107,7 @@ def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable
     def measure(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
         activity[modules[module]] = mean_activity(_channels_last(module, inputs[0]))
 
-    with _forward_hooks(modules, measure), th.no_grad():
+    with forward_hooks(modules, measure), th.no_grad():
         run()
 
     of_layers = []
@@ -162,11 +145,3 @@ def _feeds_more(tagged: th.Tensor, source: th.Tensor, tags: list[th.Tensor]) -> 
     known = source >= 0
     expected = th.zeros_like(th.cat(gradients)).index_add(0, source[known], weights[known])
     return ~th.isclose(th.cat(gradients), expected, rtol=1e-3)
-
-
-@contextmanager
-def _forward_hooks(modules: Any, hook: Callable[..., Any]) -> Iterator[None]:
-    with ExitStack() as stack:
-        for module in modules:
-            stack.callback(module.register_forward_hook(hook).remove)
-        yield
