@@ -71,7 +71,6 @@ class NetworkHealth(TrainingInterval):
         super()._on_training_start()
         self._on_training_end()  # of training that was interrupted
         remember_initial_parameters(self.model)
-        self._is_first = True
         self._gradient_norms: dict[th.Tensor, th.Tensor] = {}
         # After train(), gradients are not what they were at the step: SAC's actor loss adds its own to the critic's
         self._hooks = tuple(
@@ -90,10 +89,7 @@ class NetworkHealth(TrainingInterval):
                     self._gradient_norms[parameter] = th.linalg.vector_norm(parameter.grad)
 
     def _on_rollout_end(self) -> None:
-        if isinstance(self.model, OffPolicyAlgorithm) and self.model.num_timesteps <= self.model.learning_starts:
-            return  # SB3 does not learn from this rollout
-        if self._is_due() or self._is_first:
-            self._is_first = False
+        if self._is_due_to_look():
             self._log()
 
     def _log(self) -> None:

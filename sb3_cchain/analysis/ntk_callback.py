@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import torch as th
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as MatplotlibFigure
+from matplotlib.image import AxesImage
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -33,8 +35,9 @@ class NTKCallback(TrainingInterval):
 
     The paper's are m = 100 and δ = 0.01, at every iteration.
 
-    Training is the same with and without it. It costs m forward and backward passes of a minibatch, vectorised where there
-    are no convolutions, and m times the memory of the parameters.
+    It acts at the end of the first rollout after which the model learns, before that update; then at the end of each rollout
+    in which a multiple of ``interval`` was reached. Training is the same with and without it. It costs m forward and backward
+    passes of a minibatch, vectorised where there are no convolutions, and m times the memory of the parameters.
 
     :param n_minibatches: m, the size of the matrix; it is the rollout's size where that is smaller
     :param delta: δ
@@ -48,6 +51,8 @@ class NTKCallback(TrainingInterval):
     """
 
     model: OnPolicyAlgorithm | DQN
+    # The latest
+    matrix: th.Tensor
 
     def __init__(
         self,
@@ -81,17 +86,17 @@ class NTKCallback(TrainingInterval):
         self._folder = self.path or (Path(folder) / "ntk" if folder is not None else None)
 
     def _on_rollout_end(self) -> None:
-        if not self._is_due():
+        if not self._is_due_to_look():
             return
         with unchanged_random_state():
             if isinstance(self.model, OnPolicyAlgorithm):
-                matrix = policy_ntk(self.model, self.n_minibatches)
+                self.matrix = policy_ntk(self.model, self.n_minibatches)
             else:
-                matrix = q_ntk(self.model, self.n_minibatches)
-        for name, value in ntk_statistics(matrix, self.delta).items():
+                self.matrix = q_ntk(self.model, self.n_minibatches)
+        for name, value in ntk_statistics(self.matrix, self.delta).items():
             self.logger.record(f"ntk/{name}", value)
         if self.picture_interval and self._n_matrices % self.picture_interval == 0:
-            figure = plot_ntk(matrix, f"NTK at step {self.num_timesteps}")
+            figure = plot_ntk(self.matrix, f"NTK at step {self.num_timesteps}")
             self.logger.record("ntk/matrix", Figure(figure, close=False), exclude=("stdout", "log", "json", "csv"))
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
@@ -103,15 +108,24 @@ def plot_ntk(matrix: th.Tensor, title: str) -> MatplotlibFigure:
     """
     :param matrix: An NTK
     :param title: Title
-    :return: The matrix as a picture: red above 0, blue below, white 0. The 1 % of entries of the greatest size are beyond the
-        ends of the colours, or a few of them would leave everything else white.
+    :return: A picture of the matrix
     """
     figure = MatplotlibFigure(figsize=(4.6, 4), dpi=100, layout="constrained")
     axes = figure.add_subplot()
-    limit = matrix.abs().quantile(0.99).item()
-    image = axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-    axes.set_title(title)
-    axes.set_xlabel("minibatch")
-    axes.set_ylabel("minibatch")
-    figure.colorbar(image, extend="both", label="inner product of gradients")
+    figure.colorbar(draw_ntk(axes, matrix, title), extend="both", label="inner product of gradients")
     return figure
+
+
+def draw_ntk(axes: Axes, matrix: th.Tensor, title: str) -> AxesImage:
+    """
+    Red above 0, blue below, white 0. The 1 % of entries of the greatest size are beyond the ends of the colours, or a few of
+    them would leave everything else white.
+
+    :param axes: Where to
+    :param matrix: An NTK
+    :param title: Title
+    :return: The image
+    """
+    limit = matrix.abs().quantile(0.99).item()
+    axes.set(title=title, xlabel="minibatch", ylabel="minibatch")
+    return axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")

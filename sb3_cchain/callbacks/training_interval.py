@@ -34,6 +34,7 @@ class TrainingInterval(BaseCallback):
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
         self._interval = self.interval or self._defaults[0 if on_policy else 1]
         self._n_trained = self._count()
+        self._has_looked = False
 
     def _on_step(self) -> bool:
         return True
@@ -48,6 +49,13 @@ class TrainingInterval(BaseCallback):
         """Whether a multiple of the interval was reached since the last call."""
         before, self._n_trained = self._n_trained, self._count()
         return self._n_trained // self._interval > before // self._interval
+
+    def _is_due_to_look(self) -> bool:
+        """At a rollout's end, for callbacks that log: as ``_is_due()``, and at the first one that the model learns from."""
+        if isinstance(self.model, OffPolicyAlgorithm) and self.model.num_timesteps <= self.model.learning_starts:
+            return False
+        is_first, self._has_looked = not self._has_looked, True
+        return self._is_due() or is_first
 
     def _sample_observations(self, batch_size: int) -> PyTorchObs:
         """
