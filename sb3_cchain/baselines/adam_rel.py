@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.baselines.model_optimizers import model_optimizers
+from sb3_cchain.common.model_optimizers import model_optimizers
 
 _NO_STEP_COUNT = "AdamRel needs an optimiser with a step count, as Adam has, got {}"
 

@@ -3,8 +3,8 @@
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.baselines.model_optimizers import model_optimizers
 from sb3_cchain.baselines.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.common.model_optimizers import model_optimizers
 
 
 class OptimizerMetrics(BaseCallback):
