@@ -15,6 +15,7 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+from torch.distributions import Bernoulli, Categorical
 from torch.nn import functional as F
 
 from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_squared_difference
@@ -67,7 +68,7 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
         means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
     """
     if _has_own_distribution(type(policy)):
-        return _distribution_outputs(policy.get_distribution(observations))
+        return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
     outputs = policy.action_net(policy.mlp_extractor.forward_actor(features))
@@ -88,13 +89,18 @@ def _has_own_distribution(policy_class: type[ActorCriticPolicy]) -> bool:
     )
 
 
-def _distribution_outputs(distribution: Distribution) -> th.Tensor:
-    inner: Any = distribution.distribution
-    if isinstance(distribution, MultiCategoricalDistribution):
+def distribution_outputs(distribution: Distribution) -> th.Tensor:
+    """
+    :param distribution: An action distribution of SB3, or a maskable one of sb3-contrib
+    :return: As of :func:`policy_outputs`
+    """
+    # A maskable one has several under this name, SB3's under the other
+    inner: Any = getattr(distribution, "distributions", None) or distribution.distribution
+    if isinstance(inner, list):
         return _stack_padded([categorical.probs for categorical in inner])
-    if isinstance(distribution, BernoulliDistribution):
+    if isinstance(inner, Bernoulli):
         return th.stack([1 - inner.probs, inner.probs], dim=-1)
-    return inner.probs if isinstance(distribution, CategoricalDistribution) else inner.mean
+    return inner.probs if isinstance(inner, Categorical) else inner.mean
 
 
 def _stack_padded(sub_actions: Sequence[th.Tensor]) -> th.Tensor:

@@ -1,0 +1,144 @@
+"""What the outputs of a Stable-Baselines3 model are, by kind of algorithm."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+from sb3_cchain.common.policy_outputs import distribution_outputs, policy_outputs, policy_values
+
+# "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
+Batch = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ModelOutputs:
+    """
+    Outputs of a model on a batch, without gradient. None stands for what its algorithm has not.
+
+    :param probabilities: Of a categorical policy's actions, ``(batch_size, n_actions)``; with several sub-actions
+        ``(batch_size, n_sub_actions, max_n)``, the shorter ones padded with 0
+    :param action_means: Of a continuous policy, ``(batch_size, action_dim)``: the mean of the Gaussian before any squashing
+        (PPO, A2C, TRPO), or the deterministic action as the actor gives it, between -1 and 1 (SAC, TQC, CrossQ, TD3, DDPG) and
+        before clipping (ARS)
+    :param values: State values ``(batch_size, 1)`` (PPO, A2C, TRPO); action values ``(batch_size, n_actions)`` (DQN, QRDQN);
+        each critic's values of the batch's actions ``(batch_size, n_critics)`` (SAC, TQC, CrossQ, TD3, DDPG). Where a network
+        predicts quantiles (QRDQN, TQC), their mean.
+    :param greedy_actions: The most probable or most valuable action, ``(batch_size,)`` or ``(batch_size, n_sub_actions)``
+    """
+
+    probabilities: th.Tensor | None = None
+    action_means: th.Tensor | None = None
+    values: th.Tensor | None = None
+    greedy_actions: th.Tensor | None = None
+
+
+def model_outputs(model: BaseAlgorithm, batch: Batch) -> ModelOutputs:
+    """
+    :param model: A model of any algorithm of Stable-Baselines3 or sb3-contrib
+    :param batch: ``observations``, as the networks get them; of off-policy algorithms the ``actions`` too, as in their replay
+        buffer; of MaskablePPO the ``action_masks``, if they shall apply. Recurrent networks take each observation as the first
+        of an episode.
+    :return: Its outputs, in evaluation mode
+    :raises TypeError: For an algorithm that is not known here
+    """
+    outputs = find_outputs(model)
+    with th.no_grad(), evaluation_mode(model.policy):
+        return outputs(model.policy, batch)
+
+
+def find_outputs(model: BaseAlgorithm) -> Callable[[Any, Batch], ModelOutputs]:
+    """
+    :param model: A model
+    :return: Maps its policy and a batch to the outputs
+    :raises TypeError: For an algorithm that is not known here
+    """
+    for attributes, outputs in _KINDS.items():
+        if all(hasattr(model.policy, attribute) for attribute in attributes):
+            return outputs
+    raise TypeError(f"The outputs of {type(model).__name__} with {type(model.policy).__name__} are not known")
+
+
+def _of_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
+    observations = batch["observations"]
+    if "action_masks" in batch:
+        actions = distribution_outputs(policy.get_distribution(observations, batch["action_masks"]))
+    else:
+        actions = policy_outputs(policy, observations)
+    return _with_actions(policy, actions, policy_values(policy, observations))
+
+
+def _of_recurrent_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
+    observations = batch["observations"]
+    batch_size = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    n_layers, _, hidden_size = policy.lstm_hidden_state_shape
+    zeros = th.zeros(n_layers, batch_size, hidden_size, device=policy.device)
+    at_the_start = (zeros, zeros), th.zeros(batch_size, device=policy.device)
+    distribution, _ = policy.get_distribution(observations, *at_the_start)
+    return _with_actions(policy, distribution_outputs(distribution), policy.predict_values(observations, *at_the_start))
+
+
+def _with_actions(policy: Any, actions: th.Tensor, values: th.Tensor) -> ModelOutputs:
+    if isinstance(policy.action_space, spaces.Box):
+        return ModelOutputs(action_means=actions, values=values)
+    return ModelOutputs(probabilities=actions, values=values, greedy_actions=actions.argmax(dim=-1))
+
+
+def _of_q_network(policy: Any, batch: Batch) -> ModelOutputs:
+    # The policy's: DQN's own attribute stands for something else while churn is reduced
+    return _with_greedy_actions(policy.q_net(batch["observations"]))
+
+
+def _of_quantile_network(policy: Any, batch: Batch) -> ModelOutputs:
+    return _with_greedy_actions(policy.quantile_net(batch["observations"]).mean(dim=1))
+
+
+def _with_greedy_actions(q_values: th.Tensor) -> ModelOutputs:
+    return ModelOutputs(values=q_values, greedy_actions=q_values.argmax(dim=1))
+
+
+def _of_actor_and_critics(policy: Any, batch: Batch) -> ModelOutputs:
+    observations = batch["observations"]
+    values = policy.critic(observations, batch["actions"])
+    # A tuple of (batch_size, 1), or with quantiles (batch_size, n_critics, n_quantiles)
+    values = th.cat(values, dim=1) if isinstance(values, tuple) else values.mean(dim=2)
+    return ModelOutputs(action_means=policy._predict(observations, deterministic=True), values=values)
+
+
+def _of_actor(policy: Any, batch: Batch) -> ModelOutputs:
+    actions = policy._predict(batch["observations"])
+    if isinstance(policy.action_space, spaces.Box):
+        return ModelOutputs(action_means=actions)
+    return ModelOutputs(greedy_actions=actions)
+
+
+# By the attributes of the policy, as sb3-contrib need not be installed; the first that fits
+_KINDS: dict[tuple[str, ...], Callable[[Any, Batch], ModelOutputs]] = {
+    ("lstm_actor",): _of_recurrent_actor_critic,
+    ("predict_values",): _of_actor_critic,
+    ("q_net",): _of_q_network,
+    ("quantile_net",): _of_quantile_network,
+    ("actor", "critic"): _of_actor_and_critics,
+    ("action_net",): _of_actor,  # ARS
+}
+
+
+@contextmanager
+def evaluation_mode(network: nn.Module) -> Iterator[None]:
+    """
+    Running BatchNorm statistics and no dropout inside the ``with`` block.
+
+    :param network: A network, each of whose modules gets back the mode that it was in
+    """
+    modes = [(module, module.training) for module in network.modules()]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
+            module.training = training
