@@ -1,11 +1,20 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
-from sb3_cchain.callbacks import ContinualMetrics, TaskSync
+from sb3_cchain.callbacks import ChurnMonitor, ContinualMetrics, TaskSync
 from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.envs import ContinualEnv, register_envs
 from sb3_cchain.ppo_cchain import CChainCallback, CChainPPO
 
 __version__ = "0.1.0"
-__all__ = ["CChainCallback", "CChainDQN", "CChainPPO", "ContinualEnv", "ContinualMetrics", "DoubleDQN", "TaskSync"]
+__all__ = [
+    "CChainCallback",
+    "CChainDQN",
+    "CChainPPO",
+    "ChurnMonitor",
+    "ContinualEnv",
+    "ContinualMetrics",
+    "DoubleDQN",
+    "TaskSync",
+]
 
 register_envs()

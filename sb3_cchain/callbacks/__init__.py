@@ -1,5 +1,6 @@
-"""Callbacks for training in continual environments."""
+"""Callbacks for training in continual environments, and for looking at it."""
 
+from sb3_cchain.callbacks.churn_monitor import ChurnMonitor
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
@@ -7,6 +8,7 @@ from sb3_cchain.callbacks.task_learning_starts import TaskLearningStarts
 from sb3_cchain.callbacks.task_sync import TaskSync
 
 __all__ = [
+    "ChurnMonitor",
     "ContinualMetrics",
     "EpisodicRollouts",
     "RolloutNormalizedAdvantage",

@@ -1,12 +1,11 @@
 """Acting every so much training, on data of that training."""
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_cchain.callbacks.reference_batch import sample_batch
 from sb3_cchain.validation import check_number
 
 
@@ -62,11 +61,5 @@ class TrainingInterval(BaseCallback):
         Observations as the networks get them: on-policy of the rollout, without repetition and so no more than there are;
         off-policy of the replay buffer. To be called between a rollout's end and ``train()``, which empties the former.
         """
-        if isinstance(self.model, OffPolicyAlgorithm):
-            assert self.model.replay_buffer is not None
-            return self.model.replay_buffer.sample(batch_size, env=self.model._vec_normalize_env).observations
-        buffer = self.model.rollout_buffer
-        steps, envs = np.divmod(np.random.permutation(buffer.buffer_size * buffer.n_envs)[:batch_size], buffer.n_envs)
-        if isinstance(buffer.observations, dict):
-            return obs_as_tensor({key: array[steps, envs] for key, array in buffer.observations.items()}, self.model.device)
-        return obs_as_tensor(buffer.observations[steps, envs], self.model.device)
+        observations: PyTorchObs = sample_batch(self.model, batch_size)["observations"]
+        return observations

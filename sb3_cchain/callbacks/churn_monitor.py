@@ -1,0 +1,165 @@
+"""How much the updates change the network's outputs where they were not meant to."""
+
+from collections import deque
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.analysis.churn import churn
+from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
+from sb3_cchain.callbacks.random_state import unchanged_random_state
+from sb3_cchain.callbacks.reference_batch import map_batch, recent_observations, sample_batch
+from sb3_cchain.common.model_optimizers import model_optimizers
+from sb3_cchain.validation import check_number
+
+
+class ChurnMonitor(BaseCallback):
+    r"""
+    Logs churn: how far an update moves the outputs of the network,
+    :math:`C_f(x, \theta, \Delta_\theta) = f_{\theta + \Delta_\theta}(x) - f_\theta(x)`, Tang et al. (ICML 2025),
+    https://arxiv.org/abs/2506.00592. For any algorithm of Stable-Baselines3 and sb3-contrib, with churn reduction and without,
+    to which it makes no difference: training is the same to the bit.
+
+    Every ``interval`` gradient updates a window of ``n_updates`` of them is measured, on two reference batches:
+
+    - ``fixed``: drawn once, when the first window begins, and kept with the model (``model.churn_monitor_batch``), so that
+      training that is resumed goes on with the same one;
+    - ``fresh``: drawn when the window begins, from the rollout being trained on or from the replay buffer. It may hold samples
+      of the updates' own minibatches. On-policy an update's minibatch is
+      ``(size of a minibatch) / (size of a rollout)`` of it: 1 of 25 in the Gym Control settings, 1 of 32 with PPO's defaults,
+      all with A2C. Off-policy it is next to nothing.
+
+    Logged of each, as ``churn_monitor/fixed/...`` and ``churn_monitor/fresh/...``, averaged over the windows between two logs:
+
+    - ``policy_churn``: :math:`KL(\pi_{old} \,\|\, \pi_{new})` of categorical policies, several sub-actions being summed; the
+      mean squared difference of the action means of continuous ones (of SAC, TQC, CrossQ, TD3 and DDPG of the deterministic
+      actions, between -1 and 1). Not for DQN and QRDQN, whose policy is greedy, nor for ARS with discrete actions.
+    - ``value_churn``: mean absolute change of the state values (PPO, A2C, TRPO), of all action values (DQN, QRDQN), or of all
+      critics' values of the batch's actions (SAC, TQC, CrossQ, TD3, DDPG). Not for ARS.
+    - ``greedy_action_changes``: share of the states whose most probable or most valuable action, or any of its sub-actions,
+      changed. Not for continuous actions.
+
+    An update begins with the step of the optimiser and ends when the next one begins or ``train()`` is over; with actor and
+    critic apart with the critic's step, and the actor's that follow it. ``train()`` is over when the next rollout starts: give
+    the monitor before callbacks that change the network then (ReDo, Oracle), or their change counts, too. A window of several
+    updates may span several calls of ``train()``, and what happens between these counts.
+
+    TRPO, whose policy no optimiser changes, and ARS are measured once per iteration instead, over the whole of its training,
+    whatever the interval; ARS on the last observations of its candidates.
+
+    The networks are measured in evaluation mode. Recurrent policies take each observation as the first of an episode; maskable
+    ones have the batch's action masks.
+
+    A window costs four forward passes of a batch. With the defaults this is 2 to 5 % of the time of ``train()``. The default
+    interval is a prime: one that shares a divisor with the number of minibatches of an epoch, or with the ``policy_delay`` of
+    TD3, meets the same few of them again and again.
+
+    :param interval: Gradient updates from the beginning of a window to that of the next
+    :param n_updates: Gradient updates in a window; 1 as in the paper
+    :param batch_size: Observations in each reference batch; on-policy no more than in a rollout. The fixed batch of a model
+        that has one stays.
+    :raises ValueError: Naming the argument that is out of its range; when training starts, for ARS with ``async_eval``, whose
+        observations are not seen
+    :raises TypeError: When training starts, for an algorithm that is not known
+    """
+
+    def __init__(self, interval: int = 101, n_updates: int = 1, batch_size: int = 256):
+        super().__init__()
+        check_number("interval", interval, 1, integer=True)
+        check_number("n_updates", n_updates, 1, interval, integer=True)
+        check_number("batch_size", batch_size, 1, integer=True)
+        self.interval = interval
+        self.n_updates = n_updates
+        self.batch_size = batch_size
+        # Windows go on in phase when `learn()` is called again
+        self._n_updates_seen = 0
+        # Of the window that is open: by name the batch and the outputs at the beginning, and the updates to come
+        self._window: dict[str, tuple[Batch, ModelOutputs]] = {}
+        self._n_missing = 0
+        # What is attached to the model until the next rollout starts or ends
+        self._attached = ExitStack()
+        self._observations: deque[np.ndarray] = deque()
+
+    def _init_callback(self) -> None:
+        find_outputs(self.model)
+
+    def _on_training_start(self) -> None:
+        self._on_training_end()  # of training that was interrupted
+        if self.locals.get("async_eval") is not None:
+            raise ValueError("ChurnMonitor does not see the observations of ARS with `async_eval`: set it to None")
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._attached.close()
+        optimizer = _leading_optimizer(self.model)
+        if optimizer is None:
+            self._open_window(0)
+        else:
+            # For train() alone
+            self._attached.callback(optimizer.register_step_pre_hook(self._before_update).remove)
+
+    def _on_rollout_start(self) -> None:
+        # train() is over
+        self._attached.close()
+        self._close_window_if_over()
+        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+            self._observations = self._attached.enter_context(recent_observations(self.training_env, self.batch_size))
+
+    def _on_training_end(self) -> None:
+        self._attached.close()
+        self._close_window_if_over()
+        self._window = {}
+
+    def _before_update(self, *_: Any) -> None:
+        self._close_window_if_over()
+        if self._n_updates_seen % self.interval == 0:
+            self._open_window(self.n_updates)
+        self._n_updates_seen += 1
+        self._n_missing -= 1
+
+    def _open_window(self, n_updates: int) -> None:
+        model: Any = self.model
+        with unchanged_random_state():
+            # Other numbers than those that training draws next, whose minibatch would be a part of the batch
+            np.random.seed(np.random.randint(2**32, dtype=np.uint32))
+            fresh = self._sample_batch()
+            if not hasattr(model, "churn_monitor_batch"):
+                model.churn_monitor_batch = map_batch(lambda tensor: tensor.cpu().numpy(), self._sample_batch())
+            fixed = map_batch(lambda array: th.as_tensor(array, device=model.device), model.churn_monitor_batch)
+            self._window = {name: (batch, model_outputs(model, batch)) for name, batch in (("fixed", fixed), ("fresh", fresh))}
+        self._n_missing = n_updates
+
+    def _sample_batch(self) -> Batch:
+        if isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+            return sample_batch(self.model, self.batch_size)
+        return {"observations": th.as_tensor(np.array(self._observations), device=self.model.device)}
+
+    def _close_window_if_over(self) -> None:
+        if not self._window or self._n_missing > 0:
+            return
+        with unchanged_random_state():
+            for batch_name, (batch, old) in self._window.items():
+                for name, value in churn(old, model_outputs(self.model, batch)).items():
+                    self.logger.record_mean(f"churn_monitor/{batch_name}/{name}", value)
+        self._window = {}
+
+
+def _leading_optimizer(model: BaseAlgorithm) -> th.optim.Optimizer | None:
+    """
+    :param model: A model
+    :return: The optimiser whose steps begin the updates: the critic's, where it has one of its own. None where the optimiser,
+        if any, does not make all of the changes.
+    """
+    # By its name, as sb3-contrib need not be installed
+    if any(base.__name__ == "TRPO" for base in type(model).__mro__):
+        return None
+    optimizers = model_optimizers(model)
+    return optimizers.get("critic", optimizers.get(""))
