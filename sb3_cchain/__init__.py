@@ -1,6 +1,6 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
-from sb3_cchain.callbacks import ChurnMonitor, ContinualMetrics, TaskSync
+from sb3_cchain.callbacks import ChurnMonitor, ContinualMetrics, TaskSync, TensorBoardOverview
 from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.envs import ContinualEnv, register_envs
 from sb3_cchain.ppo_cchain import CChainCallback, CChainPPO
@@ -15,6 +15,7 @@ __all__ = [
     "ContinualMetrics",
     "DoubleDQN",
     "TaskSync",
+    "TensorBoardOverview",
 ]
 
 register_envs()

@@ -14,10 +14,9 @@ from torch import nn
 
 from sb3_cchain.analysis.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.rank import effective_rank, singular_values, srank
-from sb3_cchain.baselines.crelu import CReLU
-from sb3_cchain.baselines.model_optimizers import model_optimizers
-from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS
+from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
 from sb3_cchain.common.forward_hooks import forward_hooks
+from sb3_cchain.common.model_optimizers import model_optimizers
 
 
 def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 0.025) -> dict[str, float]:

@@ -7,9 +7,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.health import group_norms, network_health, remember_initial_parameters, trained_groups
-from sb3_cchain.baselines.model_optimizers import model_optimizers
 from sb3_cchain.callbacks.random_state import unchanged_random_state
 from sb3_cchain.callbacks.training_interval import TrainingInterval
+from sb3_cchain.common.model_optimizers import model_optimizers
 from sb3_cchain.validation import check_number
 
 

@@ -8,8 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_cchain.analysis.dormancy import mean_activity
-from sb3_cchain.baselines.crelu import CReLU
-from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS
+from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, CReLU
 from sb3_cchain.common.forward_hooks import forward_hooks
 
 

@@ -7,7 +7,7 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
-from sb3_cchain.baselines.crelu import CReLU
+from sb3_cchain.common.activations import CReLU
 
 
 def hidden_layers(

@@ -15,6 +15,7 @@ from sb3_cchain.analysis.churn import churn
 from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
 from sb3_cchain.callbacks.random_state import unchanged_random_state
 from sb3_cchain.callbacks.reference_batch import map_batch, recent_observations, sample_batch
+from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.common.model_optimizers import model_optimizers
 from sb3_cchain.validation import check_number
 
@@ -91,6 +92,7 @@ class ChurnMonitor(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._on_training_end()  # of training that was interrupted
+        add_overview(self.model)
         if self.locals.get("async_eval") is not None:
             raise ValueError("ChurnMonitor does not see the observations of ARS with `async_eval`: set it to None")
 

@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.task_sync import require_continual
+from sb3_cchain.callbacks.tensorboard_overview import add_overview
 
 RETURNS_CSV = "returns.csv"
 COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
@@ -45,6 +46,7 @@ class ContinualMetrics(BaseCallback):
 
     def _on_training_start(self) -> None:
         require_continual(self, self.training_env)
+        add_overview(self.model)
         self._finished.clear()
         # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
         has_folder = self.model.tensorboard_log is not None or self.model._custom_logger

@@ -6,6 +6,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.callbacks.reference_batch import sample_batch
+from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.validation import check_number
 
 
@@ -30,6 +31,7 @@ class TrainingInterval(BaseCallback):
         self._defaults = default_on_policy, default_off_policy
 
     def _on_training_start(self) -> None:
+        add_overview(self.model)
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
         self._interval = self.interval or self._defaults[0 if on_policy else 1]
         self._n_trained = self._count()

@@ -1,5 +1,6 @@
-"""Which of torch's modules are activation functions."""
+"""Activation functions: which of torch's modules are, and concatenated ReLU."""
 
+import torch as th
 from torch import nn
 
 # Of each entry by itself. Dropout is none: it does nothing to a policy that acts.
@@ -22,3 +23,23 @@ ELEMENTWISE_ACTIVATIONS = (
 
 # Those whose units are off, and pass no gradient, for inputs below 0
 RECTIFIERS = (nn.ReLU, nn.ReLU6)
+
+
+class CReLU(nn.Module):
+    """
+    Concatenated ReLU, ``[relu(x), relu(-x)]``: twice as many features as units, of which a unit's one or other is active
+    unless its output is zero.
+
+    Shang et al. (ICML 2016), https://arxiv.org/abs/1603.05201; against the loss of plasticity: Abbas et al. (CoLLAs 2023),
+    https://arxiv.org/abs/2303.07507.
+    """
+
+    # Features for each unit
+    expansion = 2
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: ``(batch_size, n_units, ...)``
+        :return: ``(batch_size, 2 * n_units, ...)``
+        """
+        return th.cat([inputs, -inputs], dim=1).relu()

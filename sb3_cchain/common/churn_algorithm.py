@@ -10,14 +10,15 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
 from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.callbacks.task_sync import TaskSwitch
+from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
 
 
 class ChurnAlgorithm(BaseAlgorithm):
     """
-    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` that is saved with the model, and the callbacks for
-    continual environments to an SB3 algorithm. A subclass builds the reducer in ``_make_churn_reducer()`` and uses it in
-    ``train()``.
+    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` that is saved with the model, the callbacks for
+    continual environments and the overview in TensorBoard to an SB3 algorithm. A subclass builds the reducer in
+    ``_make_churn_reducer()`` and uses it in ``train()``.
 
     :param args: Arguments of the base algorithm
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
@@ -76,6 +77,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         self.churn_reducer = self._make_churn_reducer()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        add_overview(self)  # to the logger that was just made
         return super()._init_callback(with_continual_callbacks(callback, self.env), progress_bar)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:

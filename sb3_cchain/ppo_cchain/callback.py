@@ -6,6 +6,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.task_sync import TaskSwitch
+from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.churn import make_coefficient
 from sb3_cchain.common.on_policy_churn import check_choices, make_policy_reducer, reduced_churn
 
@@ -68,6 +69,7 @@ class CChainCallback(BaseCallback):
             raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
         if hasattr(self.model, "churn_reducer"):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
+        add_overview(self.model)
         # Another learn() of the same model goes on with the same λ
         if self._reduced_model is not self.model:
             self._reduced_model = self.model

@@ -1,0 +1,109 @@
+"""The charts of TensorBoard's Custom Scalars tab."""
+
+import re
+from typing import Any
+
+from stable_baselines3.common.logger import KVWriter
+from torch.utils.tensorboard import SummaryWriter
+
+# Category → title of the chart → regular expression of the tags in it, whole tags. One unit a chart.
+LAYOUT: dict[str, dict[str, str]] = {
+    "Returns": {
+        "Mean return on the task being trained": "continual/mean_return",
+        "Average return of each task": r"continual/average_task_\d+",
+        "Average performance over the tasks so far": "continual/average_performance",
+        "Task being trained": "continual/task_id",
+        "Reward per episode": "rollout/ep_rew_mean|eval/mean_reward",
+    },
+    "C-CHAIN": {
+        "Policy churn of an update": "churn/policy_churn",
+        "Value churn of an update": "churn/value_churn",
+        "Greedy actions that an update changes, share": "churn/greedy_action_changes",
+        "Churn loss": "churn/loss",
+        "λ": "churn/coef",
+        "λ · churn loss / base loss": "churn/relative_loss",
+    },
+    "Churn, monitored": {
+        "Policy churn": "churn_monitor/(fixed|fresh)/policy_churn",
+        "Value churn": "churn_monitor/(fixed|fresh)/value_churn",
+        "Greedy actions that change, share": "churn_monitor/(fixed|fresh)/greedy_action_changes",
+    },
+    "Neural tangent kernel": {
+        "srank and effective rank": "ntk/(srank|effective_rank)",
+        "Sum of |off-diagonal|": "ntk/off_diagonal_sum",
+        "Sum of |diagonal|": "ntk/diagonal_sum",
+        "Condition number": "ntk/condition_number",
+    },
+    "Network health": {
+        "Dormant units, share": "health/dormant_share(/.+)?",
+        "Active units, share": "health/active_share(/.+)?",
+        "srank of the features": "health/feature_srank(/.+)?",
+        "Effective rank of the features": "health/feature_effective_rank(/.+)?",
+        "Norm of the weights": "health/weight_norm(/.+)?",
+        "Distance from initialisation": "health/distance_from_init(/.+)?",
+        "Norm of the gradient": "health/gradient_norm(/.+)?",
+    },
+    "Related methods": {
+        "TRAC: scale": "trac/scale(_.+)?",
+        "L2 Init: distance": "l2_init/distance(_.+)?",
+        "Penalties: loss": "(l2_init|parseval)/loss(_.+)?",
+        "Weight clipping: entries at their bound, share": "weight_clipping/share(_.+)?",
+        "ReDo: dormant units, share": "redo/dormant_share(/.+)?",
+        "ReDo: units recycled": "redo/n_recycled",
+        "Resets and perturbations": "(oracle|adam_rel)/n_resets|shrink_and_perturb/n_steps",
+    },
+}
+
+
+class TensorBoardLayout(KVWriter):
+    """
+    Lays out in TensorBoard's Custom Scalars tab what the logger writes: those charts of ``LAYOUT`` of which a tag was logged.
+
+    It is an output of SB3's logger, beside the one for TensorBoard. The layout is written whenever a chart is added to it;
+    TensorBoard shows the latest.
+
+    :param writer: That of SB3's output for TensorBoard
+    """
+
+    def __init__(self, writer: SummaryWriter):
+        self._writer = writer
+        self._tags: set[str] = set()
+        self._charts = 0
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """
+        :param key_values: What is logged
+        :param key_excluded: The outputs that each is not for
+        :param step: Environment steps made
+        """
+        new = {key for key in key_values if "tensorboard" not in key_excluded[key]} - self._tags
+        if not new:
+            return
+        self._tags |= new
+        layout = layout_of(self._tags)
+        charts = sum(map(len, layout.values()))
+        if charts > self._charts:
+            self._charts = charts
+            # TensorBoard matches the beginning of a tag
+            self._writer.add_custom_scalars(
+                {
+                    category: {title: ["Multiline", [f"({tags})$"]] for title, tags in charts.items()}
+                    for category, charts in layout.items()
+                }
+            )
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Nothing of its own to close."""
+
+
+def layout_of(tags: set[str]) -> dict[str, dict[str, str]]:
+    """
+    :param tags: What a run logs
+    :return: ``LAYOUT`` without the charts and categories that would be empty
+    """
+    charts = {
+        category: {title: regex for title, regex in charts.items() if any(re.fullmatch(regex, tag) for tag in tags)}
+        for category, charts in LAYOUT.items()
+    }
+    return {category: of_category for category, of_category in charts.items() if of_category}
