@@ -57,7 +57,7 @@ class ChurnMonitor(BaseCallback):
     The networks are measured in evaluation mode. Recurrent policies take each observation as the first of an episode; maskable
     ones have the batch's action masks.
 
-    A window costs four forward passes of a batch. With the defaults this is 2 to 5 % of the time of ``train()``. The default
+    A window costs four forward passes of a batch: with the defaults 1 to 3 % of the training time. The default
     interval is a prime: one that shares a divisor with the number of minibatches of an epoch, or with the ``policy_delay`` of
     TD3, meets the same few of them again and again.
 
