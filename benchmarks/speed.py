@@ -194,14 +194,14 @@ def monitors() -> Case:
     """
     :return: Training with each of the callbacks that look at it, under small and large settings, over training without
     """
-    minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=1000)
+    minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
     cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
     # Each with the environment steps of a round
     settings: dict[str, tuple[type[BaseAlgorithm], dict[str, Any], int]] = {
-        "PPO, Gym Control": (PPO, settings_of("ppo", "Continual/Acrobot-v1"), 4000),
-        "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 8192),
-        "DQN, MinAtar": (DQN, minatar, 1000),
-        "DQN, CartPole, SB3's defaults": (DQN, cart_pole, 8000),
+        "PPO, Gym Control": (PPO, settings_of("ppo", "Continual/Acrobot-v1"), 2400),
+        "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 4096),
+        "DQN, MinAtar": (DQN, minatar, 500),
+        "DQN, CartPole, SB3's defaults": (DQN, cart_pole, 4000),
     }
     models: dict[str, Any] = {}
     pairs = []
