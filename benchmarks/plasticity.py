@@ -58,8 +58,8 @@ class Figure(NamedTuple):
 FIGURES = [
     Figure("continual/mean_return", "return per episode"),
     Figure("ntk/srank", "NTK: srank"),
-    Figure("ntk/off_diagonal_sum", "NTK: Σ|off-diagonal|", logarithmic=True),
-    Figure("ntk/diagonal_sum", "NTK: Σ|diagonal|", logarithmic=True),
+    Figure("ntk/off_diagonal_sum", "NTK: off-diagonal sum", logarithmic=True),
+    Figure("ntk/diagonal_sum", "NTK: diagonal sum", logarithmic=True),
     Figure("churn_monitor/fresh/policy_churn", "policy churn, KL", logarithmic=True),
     Figure("health/dormant_share", "dormant units, share"),
 ]
@@ -93,7 +93,7 @@ def table(runs: dict[str, list[Run]]) -> str:
             for run in of_variant:
                 steps, values = scalars(run, figure.tag)
                 task = (steps - 1) // run.steps_per_task  # the rollout that ends a task is still of that task
-                per_seed.append([values[task == i].mean() for i in range(run.n_tasks)])
+                per_seed.append([values[task == i].mean() if (task == i).any() else np.nan for i in range(run.n_tasks)])
             lines.append([figure.label, VARIANTS[name].label, *(f"{mean:.3g}" for mean in np.mean(per_seed, axis=0))])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
