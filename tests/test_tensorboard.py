@@ -17,12 +17,13 @@ from tensorboard.context import RequestContext
 from tensorboard.plugins.base_plugin import TBContext
 from tensorboard.plugins.custom_scalar.custom_scalars_plugin import CustomScalarsPlugin
 from tensorboard.plugins.hparams import metadata
+from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.scalar.scalars_plugin import ScalarsPlugin
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualEnv, ContinualMetrics, TaskSync, TensorBoardOverview
 from sb3_cchain.baselines import ReDo
+from sb3_cchain.callbacks.tensorboard_hyperparameters import hyperparameters
 from sb3_cchain.callbacks.tensorboard_layout import LAYOUT, layout_of
-from sb3_cchain.callbacks.tensorboard_overview import hyperparameters
 from tests.envs import CountEnv, RandomEnv
 
 SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=2, seed=0, device="cpu", policy_kwargs=dict(net_arch=[8]))
@@ -44,6 +45,7 @@ class TensorBoard:
         context = TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(folder)), plugin_name_to_instance={})
         context.plugin_name_to_instance["scalars"] = ScalarsPlugin(context)
         self._custom_scalars = CustomScalarsPlugin(context)
+        self._hparams = Context(context)
         self._multiplexer = multiplexer
 
     def layout(self):
@@ -72,12 +74,16 @@ class TensorBoard:
         return {tag for content in self._multiplexer.Runs().values() for tag in content["tensors"]}
 
     def hparams(self, run="."):
-        contents = self._multiplexer.PluginRunToTagToContent("hparams")[run]
-        start = metadata.parse_session_start_info_plugin_data(contents[metadata.SESSION_START_INFO_TAG])
-        experiment = metadata.parse_experiment_plugin_data(contents[metadata.EXPERIMENT_TAG])
-        values = {name: value.string_value or value.number_value for name, value in start.hparams.items()}
-        assert {info.name for info in experiment.hparam_infos} == set(values)
-        return values, [info.name.tag for info in experiment.metric_infos]
+        """Hyperparameters of a run."""
+        content = self._multiplexer.PluginRunToTagToContent("hparams")[run][metadata.SESSION_START_INFO_TAG]
+        values = metadata.parse_session_start_info_plugin_data(content).hparams
+        return {name: value.string_value or value.number_value for name, value in values.items()}
+
+    def columns(self):
+        """Hyperparameters and metrics that the HPARAMS tab shows of all runs."""
+        contents = self._hparams.hparams_metadata(RequestContext(), "")
+        experiment = self._hparams.experiment_from_metadata(RequestContext(), "", True, contents, [], None)
+        return {info.name for info in experiment.hparam_infos}, {info.name.tag for info in experiment.metric_infos}
 
 
 def count_written(folder, tag):
@@ -106,7 +112,7 @@ def test_dqn_in_an_environment_that_is_not_continual(tmp_path):
     model.learn(160)
     board = TensorBoard(tmp_path)
     assert board.titles() == {"Returns": ["Reward per episode"], "C-CHAIN": DQN_CHURN}
-    assert board.hparams("CChainDQN_1")[1] == ["rollout/ep_rew_mean"]
+    assert board.hparams("CChainDQN_1")["algorithm"] == "CChainDQN"
 
 
 def test_each_tag_of_the_monitors_has_one_chart():
@@ -145,9 +151,7 @@ def test_hyperparameters(tmp_path):
         **{**SETTINGS, "policy_kwargs": dict(net_arch=[8], activation_fn=th.nn.ReLU, optimizer_kwargs=dict(betas=(0.9, 0.9)))},
     )
     model.learn(32)
-    values, metrics = TensorBoard(tmp_path).hparams("CChainPPO_1")
-    assert metrics == ["continual/average_performance", "rollout/ep_rew_mean"]
-    assert values == {
+    assert TensorBoard(tmp_path).hparams("CChainPPO_1") == {
         "algorithm": "CChainPPO",
         "policy": "ActorCriticPolicy",
         "policy_kwargs.net_arch": "[8]",
@@ -186,6 +190,10 @@ def test_hyperparameters_of_dqn():
     assert "seed" not in values and "verbose" not in values
 
 
+def test_infinity_which_tensorboard_cannot_show_is_a_string():
+    assert hyperparameters(PPO("MlpPolicy", RandomEnv(), max_grad_norm=float("inf"), device="cpu"))["max_grad_norm"] == "inf"
+
+
 def test_an_environment_in_another_process_is_not_asked_for_its_name():
     env = make_vec_env("CartPole-v1", n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
     values = hyperparameters(PPO("MlpPolicy", env, **SETTINGS))
@@ -208,7 +216,7 @@ def test_stock_ppo(tmp_path, callbacks, category):
     board = TensorBoard(tmp_path)
     assert category in board.titles()
     assert all(tags for charts in board.layout().values() for tags in charts.values())
-    assert board.hparams("PPO_1")[0]["algorithm"] == "PPO"
+    assert board.hparams("PPO_1")["algorithm"] == "PPO"
 
 
 @pytest.mark.parametrize("algorithm, kwargs", [(A2C, dict(n_steps=8)), (DQN, dict(learning_starts=8, buffer_size=100))])
@@ -217,7 +225,7 @@ def test_other_algorithms(tmp_path, algorithm, kwargs):
     model.learn(64, callback=TensorBoardOverview(), log_interval=1)
     board = TensorBoard(tmp_path)
     assert board.titles() == {"Returns": ["Reward per episode"]}
-    assert board.hparams(f"{algorithm.__name__}_1")[0]["algorithm"] == algorithm.__name__
+    assert board.hparams(f"{algorithm.__name__}_1")["algorithm"] == algorithm.__name__
 
 
 def test_nothing_is_written_twice(tmp_path):
@@ -227,7 +235,7 @@ def test_nothing_is_written_twice(tmp_path):
     model.learn(64, callback=callbacks)
     model.learn(64, callback=callbacks, reset_num_timesteps=False)
     model.logger.close()
-    assert count_written(tmp_path, metadata.SESSION_START_INFO_TAG) == count_written(tmp_path, metadata.EXPERIMENT_TAG) == 1
+    assert count_written(tmp_path, metadata.SESSION_START_INFO_TAG) == 1
     # When the first rollout is over, and when the first updates are logged
     assert count_written(tmp_path, "custom_scalars__config__") == 2
     board = TensorBoard(tmp_path)
@@ -246,14 +254,19 @@ def test_resumed_in_the_same_folder(tmp_path):
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["CChainPPO_1"]
     board = TensorBoard(tmp_path)
     assert board.titles() == {"Returns": RETURNS, "C-CHAIN": PPO_CHURN}
-    assert board.hparams("CChainPPO_1")[0]["churn_coef"] == "auto"  # TensorBoard shows what the run began with
+    assert board.hparams("CChainPPO_1")["churn_coef"] == "auto"  # TensorBoard shows what the run began with
 
 
 def test_two_runs_side_by_side(tmp_path):
     CChainPPO("MlpPolicy", make_env(), tensorboard_log=str(tmp_path), **SETTINGS).learn(48)
     stock = PPO("MlpPolicy", make_env(), tensorboard_log=str(tmp_path), **SETTINGS)
     stock.learn(48, callback=[TaskSync(), ContinualMetrics()])
-    assert TensorBoard(tmp_path).titles() == {"Returns": RETURNS, "C-CHAIN": PPO_CHURN}
+    board = TensorBoard(tmp_path)
+    assert board.titles() == {"Returns": RETURNS, "C-CHAIN": PPO_CHURN}
+    # Whichever comes first, the table has what only one of them has
+    names, metrics = board.columns()
+    assert names == set(board.hparams("CChainPPO_1")) > set(board.hparams("PPO_1"))
+    assert {"continual/average_performance", "rollout/ep_rew_mean"} <= metrics
 
 
 class HParamCallback(BaseCallback):
@@ -270,7 +283,9 @@ class HParamCallback(BaseCallback):
 @pytest.mark.parametrize("callbacks", [[HParamCallback(), TensorBoardOverview()], [TensorBoardOverview(), HParamCallback()]])
 def test_hyperparameters_that_the_user_records_are_left_alone(tmp_path, callbacks):
     PPO("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **SETTINGS).learn(16, callback=callbacks)
-    assert TensorBoard(tmp_path).hparams("PPO_1")[0] == {"mine": 1}
+    board = TensorBoard(tmp_path)
+    assert board.hparams("PPO_1") == {"mine": 1}
+    assert board.columns() == ({"mine"}, {"rollout/ep_rew_mean"})
 
 
 def test_tags_that_are_not_for_tensorboard_are_not_laid_out(tmp_path):
@@ -297,7 +312,6 @@ def test_other_outputs_are_left_alone(tmp_path, capsys):
 def test_without_tensorboard_nothing_happens(tmp_path):
     silent = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(48, callback=TensorBoardOverview())
     assert len(silent.logger.output_formats) == 0
-    assert "hparams" not in silent.logger.name_to_value
     # And with it, training is the same to the bit
     shown = CChainPPO("MlpPolicy", make_env(), tensorboard_log=str(tmp_path), **SETTINGS).learn(48)
     for name, parameter in silent.policy.state_dict().items():

@@ -1,0 +1,103 @@
+"""The runs of TensorBoard's HPARAMS tab."""
+
+import inspect
+import math
+from collections.abc import Iterator
+from numbers import Real
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import HParam, KVWriter
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.vec_env import SubprocVecEnv
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+# Arguments that training does not depend on, and those that are named otherwise
+_LEFT_OUT = ("policy", "env", "verbose", "stats_window_size", "tensorboard_log")
+
+
+class TensorBoardHyperparameters(KVWriter):
+    """
+    Writes hyperparameters to TensorBoard at the first log, unless the user logs some by SB3's ``HParam`` then.
+
+    ``HParam`` itself would write a list of columns, too. TensorBoard takes the list of one of the runs, whichever, for all of
+    them: beside PPO, C-CHAIN's arguments would be missing. Without a list it shows what any of the runs has.
+
+    It is an output of SB3's logger, beside the one for TensorBoard.
+
+    :param writer: That of SB3's output for TensorBoard
+    :param values: Hyperparameter → value
+    """
+
+    def __init__(self, writer: SummaryWriter, values: dict[str, str | float]):
+        self._writer = writer
+        self._values = values
+        self._first = True
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """
+        :param key_values: What is logged
+        :param key_excluded: The outputs that each is not for
+        :param step: Environment steps made
+        """
+        if self._first and not any(isinstance(value, HParam) for value in key_values.values()):
+            _, session_start, _ = hparams(self._values, {})
+            assert self._writer.file_writer is not None
+            self._writer.file_writer.add_summary(session_start)
+            self._writer.flush()
+        self._first = False
+
+    def close(self) -> None:
+        """Nothing of its own to close."""
+
+
+def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
+    """
+    :param model: A model
+    :return: Names of algorithm, policy and environment (if it has one, and is not in another process), number of environments,
+        and the arguments of the algorithm and its bases that are numbers, strings, booleans or lists, or classes (by name),
+        those inside ``policy_kwargs`` included; schedules by their initial value
+    """
+    arguments = {
+        name: getattr(model, name)
+        for base in type(model).__mro__
+        for name in inspect.signature(base).parameters
+        if hasattr(model, name) and name not in _LEFT_OUT
+    }
+    for name in _SCHEDULES:
+        if callable(arguments.get(name)):
+            arguments[name] = arguments[name](1.0)
+    arguments = {
+        "algorithm": type(model),
+        "policy": model.policy_class,
+        "env": _env_id(model),
+        "n_envs": model.n_envs,
+        **arguments,
+    }
+    return {name: value for argument in arguments.items() for name, value in _flat(*argument)}
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, str | float]]:
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from _flat(f"{name}.{key}", part)
+    elif isinstance(value, TrainFreq):
+        yield name, f"{value.frequency} {value.unit.value}"
+    elif isinstance(value, (str, bool, list, tuple)):
+        yield name, str(value)  # of booleans, too, which PyTorch takes for 0.0 and 1.0
+    elif isinstance(value, Real):
+        # TensorBoard fails on infinity
+        yield name, float(value) if math.isfinite(value) else str(float(value))
+    elif isinstance(value, type):
+        yield name, value.__name__
+
+
+def _env_id(model: BaseAlgorithm) -> str | None:
+    env = model.env
+    # An environment's specification may hold what cannot be sent from another process
+    if env is None or isinstance(env.unwrapped, SubprocVecEnv) or not env.has_attr("spec"):
+        return None
+    spec = env.get_attr("spec", indices=0)[0]
+    return None if spec is None else spec.id
