@@ -1,6 +1,6 @@
 """
 The command ``sb3-cchain train|enjoy|plot_train|all_plots|plot_from_file``: RL Zoo's own commands, which know our
-algorithms and the related methods and find our hyperparameters.
+algorithms and the related methods and find our hyperparameters; and ``sb3-cchain inspect``.
 """
 
 import argparse
@@ -18,7 +18,7 @@ try:
 except ImportError as error:
     raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
-from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN, zoo_inspect
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.zoo_search import GRIDS, register_search_spaces
 
@@ -106,10 +106,15 @@ def with_our_hyperparams(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """Run RL Zoo's command line."""
-    commands = ["train", "enjoy", "plot_train", "all_plots", "plot_from_file"]
+    commands = ["train", "enjoy", "inspect", "plot_train", "all_plots", "plot_from_file"]
     if len(sys.argv) < 2 or sys.argv[1] not in commands:
-        sys.exit(f"usage: sb3-cchain {{{'|'.join(commands)}}} ...\nThe options are those of RL Zoo: sb3-cchain train --help")
+        sys.exit(
+            f"usage: sb3-cchain {{{'|'.join(commands)}}} ...\n"
+            "The options are those of RL Zoo: sb3-cchain train --help. inspect is ours: sb3-cchain inspect --help"
+        )
     register_algorithms()
+    if sys.argv[1] == "inspect":
+        return zoo_inspect.main(sys.argv[2:])
     if sys.argv[1] == "train":
         sys.argv[2:] = with_our_hyperparams(sys.argv[2:])
     rl_zoo3.cli.main()

@@ -92,15 +92,20 @@ class NetworkHealth(TrainingInterval):
         if self._is_due_to_look():
             self._log()
 
-    def _log(self) -> None:
-        with unchanged_random_state():
-            health = network_health(self.model, self._sample_observations(self.batch_size), self.tau)
+    def gradient_norms(self) -> dict[str, float]:
+        """
+        :return: ``gradient_norm`` and ``gradient_norm/<group>`` of the latest update; nothing before the first
+        """
         norms = {
             group: [self._gradient_norms[parameter] for parameter in parameters.values() if parameter in self._gradient_norms]
             for group, parameters in trained_groups(self.model).items()
         }
-        if self._gradient_norms:
-            health |= group_norms("gradient_norm", {group: of_group for group, of_group in norms.items() if of_group})
-        for name, value in health.items():
+        known = {group: of_group for group, of_group in norms.items() if of_group}
+        return group_norms("gradient_norm", known) if known else {}
+
+    def _log(self) -> None:
+        with unchanged_random_state():
+            health = network_health(self.model, self._sample_observations(self.batch_size), self.tau)
+        for name, value in {**health, **self.gradient_norms()}.items():
             # The screen has no place for long names
             self.logger.record(f"health/{name}", value, exclude=("stdout", "log") if "/" in name else None)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import torch as th
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as MatplotlibFigure
 from matplotlib.image import AxesImage
@@ -110,9 +111,9 @@ def plot_ntk(matrix: th.Tensor, title: str) -> MatplotlibFigure:
     :param title: Title
     :return: A picture of the matrix
     """
-    figure = MatplotlibFigure(figsize=(4.6, 4), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
-    figure.colorbar(draw_ntk(axes, matrix, title), extend="both", label="inner product of gradients")
+    with style.context("default"):  # RL Zoo's plots leave seaborn's behind
+        figure = MatplotlibFigure(figsize=(4.6, 4), dpi=100, layout="constrained")
+        figure.colorbar(draw_ntk(figure.add_subplot(), matrix, title), extend="both", label="inner product of gradients")
     return figure
 
 

@@ -1,0 +1,175 @@
+"""``sb3-cchain inspect``: saved models, looked at after the fact."""
+
+import hashlib
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+
+import sb3_cchain.zoo
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.analysis import NetworkHealth
+from sb3_cchain.inspection import algorithm_of, inspect_model, report
+
+OF_PPO = dict(n_steps=32, batch_size=16)
+OF_DQN = dict(learning_starts=10, buffer_size=100)
+ALGORITHMS = {PPO: OF_PPO, CChainPPO: OF_PPO, DQN: OF_DQN, DoubleDQN: OF_DQN, CChainDQN: OF_DQN}
+
+
+def make(algorithm, env="CartPole-v1"):
+    settings = ALGORITHMS.get(algorithm, {})
+    return algorithm("MlpPolicy", env, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu", **settings)
+
+
+OF_ALL = {"ntk/srank", "ntk/off_diagonal_sum", "health/dormant_share", "health/weight_norm", "health/gradient_norm"}
+OF_ALL |= {"churn_monitor/fresh/value_churn", "churn_monitor/fresh/greedy_action_changes", "rollout/mean_return"}
+
+
+def inspect(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["sb3-cchain", "inspect", *map(str, arguments)])
+    sb3_cchain.zoo.main()
+
+
+@pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+def test_from_the_command_line(algorithm, tmp_path, monkeypatch, capsys):
+    path, output = tmp_path / "model.zip", tmp_path / "output"
+    make(algorithm).learn(64).save(path)
+    before = hashlib.sha256(path.read_bytes()).hexdigest()
+    inspect(monkeypatch, path, "--env", "CartPole-v1", "--n-steps", 60, "--n-updates", 10, "--output", output)
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == before
+    assert (output / "inspection.png").stat().st_size > 10_000
+    (figures,) = json.loads((output / "inspection.json").read_text()).values()
+    assert figures.keys() >= OF_ALL
+    assert ("churn_monitor/fresh/policy_churn" in figures) == issubclass(algorithm, PPO)
+    assert all(np.isfinite(figures[tag]) for tag in OF_ALL)
+    # A model does not know how it began unless it was trained with NetworkHealth
+    assert not any("distance_from_init" in tag for tag in figures)
+    printed = capsys.readouterr().out
+    assert f"{algorithm.__name__}, 64 steps of training" in printed
+    assert "srank" in printed and "dormant share" in printed
+
+
+def test_two_models_side_by_side(tmp_path, monkeypatch, capsys):
+    model = make(PPO).learn(32, callback=NetworkHealth())
+    model.save(tmp_path / "a.zip")
+    before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
+    model.learn(64, reset_num_timesteps=False).save(tmp_path / "b.zip")
+    inspect(monkeypatch, tmp_path / "a.zip", tmp_path / "b.zip", "--env", "CartPole-v1", "--output", tmp_path)
+    a, b = json.loads((tmp_path / "inspection.json").read_text()).values()
+    assert 0 < a["health/distance_from_init"] < b["health/distance_from_init"]
+    moved = sum(((p - before[name]) ** 2).sum() for name, p in model.policy.named_parameters()).sqrt().item()
+    printed = capsys.readouterr().out
+    rows = [line.split("│") for line in printed.splitlines() if line.startswith("│ all ")]
+    assert float(rows[0][2]) == pytest.approx(moved, rel=1e-3)
+
+
+def test_equals_what_the_monitors_log_in_training_that_goes_on(tmp_path):
+    """The report's numbers are those of the next iteration of the same training."""
+    model = make(PPO).learn(64)
+    model.save(tmp_path / "model")
+    reports = []
+    for _ in range(2):
+        loaded = PPO.load(tmp_path / "model", env=make_vec_env("CartPole-v1", seed=3), device="cpu")
+        loaded.set_random_seed(3)
+        reports.append(inspect_model(loaded))
+    assert reports[0].figures == reports[1].figures
+    assert th.equal(reports[0].ntk, reports[1].ntk)
+    assert reports[0].figures["rollout/n_steps"] == 32
+    norm = sum((parameter.double() ** 2).sum() for parameter in model.policy.parameters()).sqrt().item()
+    assert reports[0].figures["health/weight_norm"] == pytest.approx(norm)
+    assert len(report(reports)) == 6
+
+
+@pytest.mark.parametrize("algorithm", [PPO, CChainPPO])
+def test_task_of_a_continual_environment(algorithm, tmp_path, monkeypatch, capsys):
+    env = make_vec_env("Continual/CartPole-v1", env_kwargs=dict(n_tasks=3, steps_per_task=32))
+    make(algorithm, env).learn(64).save(tmp_path / "model.zip")
+    seen = []
+    original = sb3_cchain.zoo_inspect.inspect_model
+
+    def spy(model, *args):
+        inspection = original(model, *args)
+        seen.append(model.env.get_attr("task_id")[0])
+        return inspection
+
+    monkeypatch.setattr("sb3_cchain.zoo_inspect.inspect_model", spy)
+    arguments = (tmp_path / "model.zip", "--env", "Continual/CartPole-v1", "--output", tmp_path)
+    kwargs = ("--env-kwargs", "n_tasks:3", "steps_per_task:50")
+    inspect(monkeypatch, *arguments, *kwargs)
+    assert seen == [1]  # steps 64 to 96
+    inspect(monkeypatch, *arguments, *kwargs, "--task", 0)
+    assert seen[-1] == 0
+    for env_id, task, message in (
+        ("CartPole-v1", 0, "unexpected keyword argument"),
+        ("Continual/CartPole-v1", 9, "first_task"),
+    ):
+        with pytest.raises(SystemExit):
+            inspect(monkeypatch, tmp_path / "model.zip", "--env", env_id, "--task", task, "--env-kwargs", "n_tasks:3")
+        assert message in capsys.readouterr().err
+
+
+def test_model_of_rl_zoo(tmp_path, monkeypatch):
+    """Wrappers, arguments and statistics are those of training."""
+    settings = tmp_path / "settings.yml"
+    settings.write_text(
+        "Continual/CartPole-v1:\n"
+        "  policy: MlpPolicy\n  n_timesteps: 64\n  n_envs: 2\n  n_steps: 32\n  batch_size: 32\n  normalize: True\n"
+        "  env_wrapper:\n    - sb3_cchain.envs.RewardScale:\n        scale: 0.5\n"
+    )
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        "sb3-cchain train --algo ppo --env Continual/CartPole-v1 --device cpu --seed 0 --eval-freq -1".split()
+        + f"-conf {settings} -f {tmp_path} --env-kwargs n_tasks:2".split(),
+    )
+    sb3_cchain.zoo.main()
+    seen = []
+    original = sb3_cchain.zoo_inspect.inspect_model
+    monkeypatch.setattr("sb3_cchain.zoo_inspect.inspect_model", lambda m, *args: (seen.append(m.env), original(m, *args))[1])
+    path = tmp_path / "ppo" / "Continual-CartPole-v1_1" / "Continual-CartPole-v1.zip"
+    inspect(monkeypatch, path, "--env", "Continual/CartPole-v1", "--output", tmp_path)
+    (env,) = seen
+    assert env.num_envs == 2
+    assert env.get_attr("n_tasks") == [2, 2]
+    assert env.training and env.norm_reward and env.obs_rms.count > 64
+    assert any(type(wrapper).__name__ == "RewardScale" for wrapper in _wrappers(env.venv.envs[0]))
+
+
+def _wrappers(env):
+    while hasattr(env, "env"):
+        yield env
+        env = env.env
+
+
+@pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+def test_algorithm_is_told_from_the_file(algorithm, tmp_path):
+    make(algorithm).save(tmp_path / "model")
+    assert algorithm_of(tmp_path / "model.zip") is algorithm
+
+
+def test_other_algorithms_are_to_be_named(tmp_path, monkeypatch, capsys):
+    make(A2C).save(tmp_path / "a2c")
+    make(SAC, "Pendulum-v1").save(tmp_path / "sac")
+    for name in ("a2c", "sac"):
+        with pytest.raises(ValueError, match="saved by neither PPO nor DQN"):
+            algorithm_of(tmp_path / f"{name}.zip")
+    with pytest.raises(SystemExit):
+        inspect(monkeypatch, tmp_path / "a2c.zip", "--env", "CartPole-v1")
+    assert "give its --algo" in capsys.readouterr().err
+    inspect(monkeypatch, tmp_path / "a2c.zip", "--env", "CartPole-v1", "--algo", "a2c", "--output", tmp_path)
+
+
+def test_errors(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        inspect(monkeypatch, tmp_path / "none.zip", "--env", "CartPole-v1")
+    assert "no such file" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        inspect(monkeypatch, "a.zip", "b.zip", "c.zip", "--env", "CartPole-v1")
+    assert "two to compare; got 3" in capsys.readouterr().err
+    model = make(DQN)
+    with pytest.raises(ValueError, match=r"`n_updates` must be .* got 0"):
+        inspect_model(model, n_updates=0)
