@@ -2,7 +2,7 @@
 Vanilla, C-CHAIN and the related methods in an environment of the paper, under the shipped hyperparameters: trains, and writes
 a table and learning curves. The same command goes on where it was interrupted.
 
-    python -m benchmarks.compare --suite gym_control --env Continual/Acrobot-v1 --n-tasks 4 --steps-per-task 64000 --seeds 0 1 2
+    python -m benchmarks.compare --suite gym_control --env Continual/Acrobot-v1 --n-tasks 4 --steps-per-task 64000 --seeds 0 1
     python -m benchmarks.compare --suite minatar --steps-per-task 100000 --eval-freq 10000 --seeds 0 1
 """
 
