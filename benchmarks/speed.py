@@ -30,6 +30,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
+from sb3_cchain.analysis import NetworkHealth, NTKCallback
 from sb3_cchain.baselines import (
     TRAC,
     AdamRel,
@@ -186,8 +187,13 @@ def minatar(n_past_updates: int = 0) -> Case:
     )
 
 
-# What is looked at in training, each with its defaults
-MONITORS: dict[str, type[BaseCallback]] = {"ChurnMonitor": ChurnMonitor}
+# What is looked at in training, each with its defaults. NTKCallback and NetworkHealth look at the first iteration of each
+# `learn()`, so in short rounds more often than at their intervals.
+MONITORS: dict[str, type[BaseCallback]] = {
+    "ChurnMonitor": ChurnMonitor,
+    "NTKCallback": NTKCallback,
+    "NetworkHealth": NetworkHealth,
+}
 
 
 def monitors() -> Case:
