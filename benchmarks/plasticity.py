@@ -124,10 +124,12 @@ def plot(runs: dict[str, list[Run]], path: Path, title: str, window: int = 5) ->
             to, back = (np.log, np.exp) if figure.logarithmic else (np.asarray, np.asarray)
             mean = back(np.mean([to(np.interp(grid, *curve)) for curve in curves], axis=0))
             panel.plot(grid, mean, color=variant.color, linewidth=2.0, label=variant.label)
-        for task in range(1, run.n_tasks):
-            panel.axvline(task * run.steps_per_task, color="0.35", linestyle="--", linewidth=1)
         if figure.logarithmic:
             panel.set_yscale("log")
+            # What a policy that has become certain is left with would take most of the scale
+            panel.set_ylim(bottom=1e-4 * max(line.get_ydata().max() for line in panel.get_lines()))
+        for task in range(1, run.n_tasks):
+            panel.axvline(task * run.steps_per_task, color="0.35", linestyle="--", linewidth=1)
         panel.set_ylabel(figure.label)
         panel.set_xlim(0, run.total_steps)
         panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
