@@ -69,21 +69,24 @@ def scalars(run: Run, tag: str) -> tuple[np.ndarray, np.ndarray]:
     """
     :param run: A finished run
     :param tag: Name of a scalar in TensorBoard
-    :return: Environment steps and values, as logged; none where it was not
+    :return: Environment steps of the rollout that it belongs to, and values; none where it was not logged
     """
     (events,) = run.folder.glob("tensorboard/*/*/events.out.tfevents.*")
     accumulator = EventAccumulator(str(events), size_guidance={"scalars": 0, "images": 1})
     accumulator.Reload()
     if tag not in accumulator.Tags()["scalars"]:
         return np.array([]), np.array([])
-    logged = accumulator.Scalars(tag)
-    return np.array([event.step for event in logged]), np.array([event.value for event in logged])
+    steps, values = np.array([(event.step, event.value) for event in accumulator.Scalars(tag)]).T
+    if tag.startswith("churn"):
+        # SB3 writes what `train()` logs at the end of the next rollout
+        steps -= np.diff([event.step for event in accumulator.Scalars("ntk/srank")]).min()
+    return steps, values
 
 
 def table(runs: dict[str, list[Run]]) -> str:
     """
     :param runs: Finished runs of each variant
-    :return: For each figure and variant, its mean over the logs of each task, and over the seeds
+    :return: For each figure and variant its mean over the logs of each task, for each of the seeds
     """
     run = next(iter(runs.values()))[0]
     lines = [["", "", *(f"task {task}" for task in range(run.n_tasks))], ["---"] * (run.n_tasks + 2)]
@@ -94,13 +97,14 @@ def table(runs: dict[str, list[Run]]) -> str:
                 steps, values = scalars(run, figure.tag)
                 task = (steps - 1) // run.steps_per_task  # the rollout that ends a task is still of that task
                 per_seed.append([values[task == i].mean() if (task == i).any() else np.nan for i in range(run.n_tasks)])
-            lines.append([figure.label, VARIANTS[name].label, *(f"{mean:.3g}" for mean in np.mean(per_seed, axis=0))])
+            cells = [" / ".join(f"{mean:.3g}" for mean in of_task) for of_task in zip(*per_seed, strict=True)]
+            lines.append([figure.label, VARIANTS[name].label, *cells])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def plot(runs: dict[str, list[Run]], path: Path, title: str, window: int = 5) -> None:
     """
-    A panel for each figure: a thin line per run, a thick one for the mean over seeds, and the task switches.
+    A panel for each figure: a line per run, and the task switches.
 
     :param runs: Finished runs of each variant
     :param path: PNG file
@@ -117,17 +121,13 @@ def plot(runs: dict[str, list[Run]], path: Path, title: str, window: int = 5) ->
             if not curves:
                 continue
             variant = VARIANTS[name]
-            for curve in curves if len(curves) > 1 else []:
-                panel.plot(*curve, color=variant.color, linewidth=0.6, alpha=0.5)
-            grid = np.linspace(max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves), 300)
-            # On a logarithmic scale the geometric mean, which one of the seeds does not make alone
-            to, back = (np.log, np.exp) if figure.logarithmic else (np.asarray, np.asarray)
-            mean = back(np.mean([to(np.interp(grid, *curve)) for curve in curves], axis=0))
-            panel.plot(grid, mean, color=variant.color, linewidth=2.0, label=variant.label)
+            for i, curve in enumerate(curves):
+                label = variant.label if i == 0 else None
+                panel.plot(*curve, color=variant.color, linewidth=1.6, alpha=0.9 if i == 0 else 0.6, label=label)
         if figure.logarithmic:
             panel.set_yscale("log")
             # What a policy that has become certain is left with would take most of the scale
-            panel.set_ylim(bottom=1e-4 * max(line.get_ydata().max() for line in panel.get_lines()))
+            panel.set_ylim(bottom=1e-4 * max(np.max(line.get_ydata()) for line in panel.get_lines()))
         for task in range(1, run.n_tasks):
             panel.axvline(task * run.steps_per_task, color="0.35", linestyle="--", linewidth=1)
         panel.set_ylabel(figure.label)

@@ -1,6 +1,7 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
-from sb3_cchain.callbacks import ChurnMonitor, ContinualMetrics, TaskSync, TensorBoardOverview
+from sb3_cchain.analysis import ChurnMonitor
+from sb3_cchain.callbacks import ContinualMetrics, TaskSync, TensorBoardOverview
 from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.envs import ContinualEnv, register_envs
 from sb3_cchain.ppo_cchain import CChainCallback, CChainPPO

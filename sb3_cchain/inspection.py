@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -19,11 +20,12 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.dqn.policies import DQNPolicy
 
-from sb3_cchain.analysis import NetworkHealth, NTKCallback
+from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.health import group_norms, trained_groups
 from sb3_cchain.analysis.ntk_callback import draw_ntk
-from sb3_cchain.callbacks import ChurnMonitor, TaskSync
+from sb3_cchain.callbacks import TaskSync
 from sb3_cchain.callbacks.task_sync import is_continual
+from sb3_cchain.common.replaced import replaced
 from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.ppo_cchain import CChainPPO
 from sb3_cchain.validation import check_number
@@ -52,46 +54,59 @@ class Inspection:
     parameters: dict[str, dict[str, th.Tensor]]
 
 
-def inspect_model(model: BaseAlgorithm, name: str = "model", n_steps: int = 2048, n_updates: int = 100) -> Inspection:
+def inspect_model(
+    model: BaseAlgorithm,
+    name: str = "model",
+    n_steps: int = 2048,
+    n_updates: int = 100,
+    callbacks: Sequence[BaseCallback] = (),
+) -> Inspection:
     """
     Rolls the model out and trains it a little, as its training would go on, and looks at it with
     :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` and
     :class:`~sb3_cchain.analysis.NetworkHealth`. The model is not what it was afterwards.
 
     On-policy, that is one iteration. Off-policy, ``n_steps`` steps fill a replay buffer, which is not saved with a model, and
-    ``n_updates`` updates are made on it. Learning rates with a schedule have the value of the schedule's end: with one
-    that ends at 0 there is no churn.
+    ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
+    moment when the model was saved; where the learning rate had come down to 0, there is no churn.
 
     :param model: A PPO, A2C, DQN or one of sb3-contrib's that the monitors know, with an environment
     :param name: What it is called in reports
     :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
     :param n_updates: Gradient updates, for off-policy algorithms
+    :param callbacks: Those that it was trained with, as far as training depends on them
     :return: What was found
     :raises ValueError: Naming the argument that is out of its range
     """
     check_number("n_steps", n_steps, 1, integer=True)
     check_number("n_updates", n_updates, 1, integer=True)
     model.set_logger(Logger(folder=None, output_formats=[]))
-    model.ep_info_buffer = None  # of its training
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
     elif isinstance(model, OffPolicyAlgorithm):
         model.learning_starts = 0
         model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         model.gradient_steps = n_updates
+    # Of this rollout, and of all of it
+    model.ep_info_buffer, model._stats_window_size = None, n_steps
     parameters = {
         group: {name: parameter.detach().clone() for name, parameter in of_group.items()}
         for group, of_group in trained_groups(model).items()
     }
     knows_its_start = hasattr(model, "initial_parameters")
     ntk, health = NTKCallback(interval=1, picture_interval=0), NetworkHealth(interval=1)
-    follow_tasks = [TaskSync()] if is_continual(model.env) else []
-    model.learn(
-        n_steps,
-        callback=[*follow_tasks, ChurnMonitor(interval=1), ntk, health],
-        log_interval=_NEVER,
-        reset_num_timesteps=False,
-    )
+    # What it was trained with looks at itself no more
+    others = [callback for callback in callbacks if not isinstance(callback, (ChurnMonitor, NTKCallback, NetworkHealth))]
+    if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
+        others.insert(0, TaskSync())
+    # The schedules stay where they are, instead of going to their ends
+    with replaced(model, "_update_current_progress_remaining", lambda *_: None):
+        model.learn(
+            n_steps,
+            callback=[*others, ChurnMonitor(interval=1), ntk, health],
+            log_interval=_NEVER,
+            reset_num_timesteps=False,
+        )
     figures = {
         tag: float(value)
         for tag, value in model.logger.name_to_value.items()
@@ -138,9 +153,9 @@ def report(inspections: Sequence[Inspection]) -> list[Table]:
         ("Networks", "health/"),
     ):
         tags = [tag for tag in _tags(inspections, prefix) if "/" not in tag.removeprefix(prefix)]
-        tables.append(_table(title, inspections, {tag.removeprefix(prefix).replace("_", " "): tag for tag in tags}))
+        tables.append(_table(title, inspections, {_words(tag.removeprefix(prefix)): tag for tag in tags}))
     tags = sorted((tag for tag in _tags(inspections, "health/") if tag.count("/") > 1), key=_group)
-    rows = {f"{_group(tag)}: {tag.split('/')[1].replace('_', ' ')}": tag for tag in tags}
+    rows = {f"{_group(tag)}: {_words(tag.split('/')[1])}": tag for tag in tags}
     tables.append(_table("Groups of layers", inspections, rows))
     if len(inspections) == 2:
         tables.append(_distances(*inspections))
@@ -149,15 +164,25 @@ def report(inspections: Sequence[Inspection]) -> list[Table]:
 
 def _distances(a: Inspection, b: Inspection) -> Table:
     table = Table("", "L2 distance", title=f"From {a.name}'s parameters to {b.name}'s", title_justify="left", min_width=60)
+    shapes_of_a, shapes_of_b = (
+        {group: [(name, p.shape) for name, p in of_group.items()] for group, of_group in inspection.parameters.items()}
+        for inspection in (a, b)
+    )
     differences = {
         group: [b.parameters[group][name] - parameter for name, parameter in of_group.items()]
         for group, of_group in a.parameters.items()
-        if {name: p.shape for name, p in of_group.items()}
-        == {name: p.shape for name, p in b.parameters.get(group, {}).items()}
+        if shapes_of_a[group] == shapes_of_b.get(group)
     }
-    for name, distance in group_norms("all", differences).items():
-        table.add_row(name.removeprefix("all/"), f"{distance:.4g}")
+    for name, distance in group_norms("together", differences).items():
+        table.add_row(name.removeprefix("together/"), f"{distance:.4g}" if differences else "")
+    for group in dict.fromkeys([*shapes_of_a, *shapes_of_b]):
+        if group not in differences:
+            table.add_row(group, "not of the same shape")
     return table
+
+
+def _words(name: str) -> str:
+    return "gradient norm, after clipping" if name == "gradient_norm" else name.replace("_", " ")
 
 
 def _group(tag: str) -> str:

@@ -2,31 +2,40 @@
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 from rich.console import Console
 from rl_zoo3 import ALGOS
-from rl_zoo3.utils import StoreDict, create_test_env, get_saved_hyperparams
+from rl_zoo3.utils import StoreDict, create_test_env, get_callback_list, get_saved_hyperparams
+from stable_baselines3 import DQN
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.inspection import algorithm_of, inspect_model, plot, report
 
 
-def make_zoo_env(model_path: Path, env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
+def make_as_trained(
+    model_path: Path, env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]
+) -> tuple[VecEnv, list[BaseCallback]]:
     """
-    The environment that a model was trained in by RL Zoo, with its arguments, wrappers and normalisation; for a model that
-    lies in no folder of RL Zoo's, the environment as it is.
+    What a model was trained in by RL Zoo: the environment with its arguments, wrappers and normalisation, and the callbacks of
+    its settings. For a model that lies in no folder of RL Zoo's, the environment as it is.
 
     :param model_path: The saved model
     :param env_id: Environment id
     :param n_envs: Number of environments
     :param seed: Seed
     :param env_kwargs: Arguments of the environment, besides those it was trained with
-    :return: The environment, as in training
+    :return: The environment, as in training, and the callbacks
     """
     folder = model_path.parent / env_id.replace("/", "-")
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
@@ -34,6 +43,7 @@ def make_zoo_env(model_path: Path, env_id: str, n_envs: int, seed: int, env_kwar
         trained_with = yaml.load((folder / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
         env_kwargs = {**(trained_with["env_kwargs"] or {}), **env_kwargs}
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
+    callbacks = get_callback_list(hyperparams)
     env = create_test_env(
         env_id,
         n_envs,
@@ -47,7 +57,18 @@ def make_zoo_env(model_path: Path, env_id: str, n_envs: int, seed: int, env_kwar
     normalize = unwrap_vec_normalize(env)
     if normalize is not None:
         normalize.training, normalize.norm_reward = True, norm_reward
-    return env
+    return env, callbacks
+
+
+def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """
+    :return: By name on the command line, those of RL Zoo's algorithms of which all can be reported
+    """
+    return {
+        name: algorithm
+        for name, algorithm in ALGOS.items()
+        if (issubclass(algorithm, (OnPolicyAlgorithm, DQN)) or name == "qrdqn") and name != "ppo_lstm"
+    }
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -72,7 +93,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--task", type=int, help="Task of a continual environment, by default the one that training would go on with"
     )
-    parser.add_argument("--algo", choices=sorted(ALGOS), help="Algorithm, by default told from the file")
+    parser.add_argument("--algo", choices=sorted(known_algorithms()), help="Algorithm, by default told from the file")
     parser.add_argument("--n-steps", type=int, default=2048, help="Environment steps of a DQN's rollout; a PPO's is its own")
     parser.add_argument("--n-updates", type=int, default=100, help="Gradient updates of a DQN whose churn is measured")
     parser.add_argument("--seed", type=int, default=0, help="Seed of rollout and updates")
@@ -93,24 +114,28 @@ def main(arguments: Sequence[str]) -> None:
     inspections = []
     for name, path in zip(names, args.models, strict=True):
         try:
-            algorithm = ALGOS[args.algo] if args.algo else algorithm_of(path)
-        except ValueError as error:
-            parser.error(str(error))
-        # The buffer is as large as what is rolled out
-        settings = {"buffer_size": args.n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
-        model = algorithm.load(path, device=args.device, **settings)
-        try:
-            env = make_zoo_env(path, args.env, model.n_envs, args.seed, env_kwargs)
-        except (TypeError, ValueError) as error:
-            parser.error(f"{args.env} cannot be made with {env_kwargs}: {error}")
-        model.set_env(env)
+            algorithm = known_algorithms()[args.algo] if args.algo else algorithm_of(path)
+            data, *_ = load_from_zip_file(path, device="cpu", load_data=True)
+            assert data is not None
+            env, callbacks = make_as_trained(path, args.env, data["n_envs"], args.seed, env_kwargs)
+            # The buffer is as large as what is rolled out
+            settings = {"buffer_size": args.n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
+            model = algorithm.load(path, env, device=args.device, **settings)
+        except (TypeError, ValueError, gym.error.Error) as error:
+            parser.error(f"{path} in {args.env} {env_kwargs or ''}: {error}")
+        if model.lr_schedule(model._current_progress_remaining) == 0:
+            console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
         model.set_random_seed(args.seed)
         console.print(f"{name}: {path}, {algorithm.__name__}, {model.num_timesteps} steps of training", soft_wrap=True)
-        inspections.append(inspect_model(model, name, args.n_steps, args.n_updates))
+        inspections.append(inspect_model(model, name, args.n_steps, args.n_updates, callbacks))
         env.close()
     for table in report(inspections):
         console.print(table)
     plot(inspections, args.output / "inspection.png")
-    figures = {str(path): inspection.figures for path, inspection in zip(args.models, inspections, strict=True)}
+    figures = [
+        # JSON has neither infinity nor what is not a number
+        {"model": str(path), **{tag: value if math.isfinite(value) else None for tag, value in inspection.figures.items()}}
+        for path, inspection in zip(args.models, inspections, strict=True)
+    ]
     (args.output / "inspection.json").write_text(json.dumps(figures, indent=1))
     console.print(f"Written: {args.output}/inspection.png, {args.output}/inspection.json", soft_wrap=True)

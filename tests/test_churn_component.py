@@ -174,3 +174,23 @@ def test_save_load_and_the_callback_form(component, tmp_path):
 def test_unknown_component(make):
     with pytest.raises(ValueError, match="`churn_component` must be one of 'full', 'projection', 'orthogonal', got 'proj'"):
         make(churn_component="proj")
+
+
+def test_small_gradients_are_projected_too():
+    # The square of 1e-25 is 0 in single precision
+    base, churn = [th.tensor([3e-25, 4e-25])], [th.tensor([1.0, 2.0])]
+    projection = gradient_component(churn, base, "projection")[0]
+    th.testing.assert_close(projection, th.tensor([1.32, 1.76]))
+
+
+@pytest.mark.parametrize("component", ["full", "projection", "orthogonal"])
+@pytest.mark.parametrize("n_frozen", [1, 4])
+def test_frozen_layers(component, n_frozen):
+    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_coef=COEF, churn_component=component, **SETTINGS)
+    actor = [*model.policy.mlp_extractor.policy_net.parameters(), *model.policy.action_net.parameters()]
+    before = [parameter.clone() for parameter in actor]
+    for parameter in actor[:n_frozen]:
+        parameter.requires_grad_(False)
+    model.learn(64)
+    moved = [not th.equal(parameter, old) for parameter, old in zip(actor, before, strict=True)]
+    assert moved == [False] * n_frozen + [True] * (4 - n_frozen)

@@ -17,7 +17,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-import sb3_cchain
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor
 from sb3_cchain.common.model_optimizers import model_optimizers
 from tests.envs import RandomEnv
@@ -369,7 +368,7 @@ def test_the_fresh_batch_is_not_the_next_minibatch():
 
 
 def test_it_is_reached_from_yaml():
-    assert get_class_by_name("sb3_cchain.ChurnMonitor") is sb3_cchain.callbacks.ChurnMonitor
+    assert get_class_by_name("sb3_cchain.ChurnMonitor") is ChurnMonitor
 
 
 @pytest.mark.parametrize(
@@ -391,3 +390,21 @@ def test_of_an_unknown_algorithm():
     model.policy = nn.Identity()
     with pytest.raises(TypeError, match="outputs of PPO with Identity are not known"):
         ChurnMonitor().init_callback(model)
+
+
+def test_nothing_is_watched_after_an_interruption():
+    """Neither by training without the callback, nor twice by training with it."""
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
+    step = model.policy.optimizer.step
+
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    model.policy.optimizer.step = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, callback=ChurnMonitor(interval=1))
+    model.policy.optimizer.step = step
+    assert model.policy.optimizer._optimizer_step_pre_hooks
+    model.learn(64, reset_num_timesteps=False)
+    assert not model.policy.optimizer._optimizer_step_pre_hooks
+    assert not any("churn_monitor" in key for key in model.logger.name_to_value)

@@ -42,7 +42,8 @@ def test_from_the_command_line(algorithm, tmp_path, monkeypatch, capsys):
     inspect(monkeypatch, path, "--env", "CartPole-v1", "--n-steps", 60, "--n-updates", 10, "--output", output)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == before
     assert (output / "inspection.png").stat().st_size > 10_000
-    (figures,) = json.loads((output / "inspection.json").read_text()).values()
+    (figures,) = json.loads((output / "inspection.json").read_text())
+    assert figures.pop("model") == str(path)
     assert figures.keys() >= OF_ALL
     assert ("churn_monitor/fresh/policy_churn" in figures) == issubclass(algorithm, PPO)
     assert all(np.isfinite(figures[tag]) for tag in OF_ALL)
@@ -59,11 +60,11 @@ def test_two_models_side_by_side(tmp_path, monkeypatch, capsys):
     before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
     model.learn(64, reset_num_timesteps=False).save(tmp_path / "b.zip")
     inspect(monkeypatch, tmp_path / "a.zip", tmp_path / "b.zip", "--env", "CartPole-v1", "--output", tmp_path)
-    a, b = json.loads((tmp_path / "inspection.json").read_text()).values()
+    a, b = json.loads((tmp_path / "inspection.json").read_text())
     assert 0 < a["health/distance_from_init"] < b["health/distance_from_init"]
     moved = sum(((p - before[name]) ** 2).sum() for name, p in model.policy.named_parameters()).sqrt().item()
     printed = capsys.readouterr().out
-    rows = [line.split("│") for line in printed.splitlines() if line.startswith("│ all ")]
+    rows = [line.split("│") for line in printed.splitlines() if line.startswith("│ together ")]
     assert float(rows[0][2]) == pytest.approx(moved, rel=1e-3)
 
 
@@ -119,6 +120,8 @@ def test_model_of_rl_zoo(tmp_path, monkeypatch):
         "Continual/CartPole-v1:\n"
         "  policy: MlpPolicy\n  n_timesteps: 64\n  n_envs: 2\n  n_steps: 32\n  batch_size: 32\n  normalize: True\n"
         "  env_wrapper:\n    - sb3_cchain.envs.RewardScale:\n        scale: 0.5\n"
+        "  callback:\n    - sb3_cchain.callbacks.EpisodicRollouts\n    - sb3_cchain.ChurnMonitor\n"
+        "  normalize_advantage: False\n"
     )
     monkeypatch.setattr(
         sys,
@@ -129,10 +132,13 @@ def test_model_of_rl_zoo(tmp_path, monkeypatch):
     sb3_cchain.zoo.main()
     seen = []
     original = sb3_cchain.zoo_inspect.inspect_model
-    monkeypatch.setattr("sb3_cchain.zoo_inspect.inspect_model", lambda m, *args: (seen.append(m.env), original(m, *args))[1])
+    monkeypatch.setattr(
+        "sb3_cchain.zoo_inspect.inspect_model", lambda m, *args: (seen.append((m.env, args[-1])), original(m, *args))[1]
+    )
     path = tmp_path / "ppo" / "Continual-CartPole-v1_1" / "Continual-CartPole-v1.zip"
     inspect(monkeypatch, path, "--env", "Continual/CartPole-v1", "--output", tmp_path)
-    (env,) = seen
+    ((env, callbacks),) = seen
+    assert [type(callback).__name__ for callback in callbacks] == ["EpisodicRollouts", "ChurnMonitor"]
     assert env.num_envs == 2
     assert env.get_attr("n_tasks") == [2, 2]
     assert env.training and env.norm_reward and env.obs_rms.count > 64
@@ -170,6 +176,41 @@ def test_errors(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         inspect(monkeypatch, "a.zip", "b.zip", "c.zip", "--env", "CartPole-v1")
     assert "two to compare; got 3" in capsys.readouterr().err
+    make(PPO).save(tmp_path / "model")
+    for arguments, message in (
+        (["--env", "NoSuchEnv-v0"], "NoSuchEnv"),
+        (["--env", "Pendulum-v1"], "spaces do not match"),
+        (["--env", "CartPole-v1", "--algo", "sac"], "invalid choice"),
+    ):
+        with pytest.raises(SystemExit):
+            inspect(monkeypatch, tmp_path / "model.zip", *arguments)
+        assert message in capsys.readouterr().err
     model = make(DQN)
     with pytest.raises(ValueError, match=r"`n_updates` must be .* got 0"):
         inspect_model(model, n_updates=0)
+
+
+def test_schedules_stay_where_they_were(tmp_path, monkeypatch, capsys):
+    def at(share):
+        model = PPO("MlpPolicy", "CartPole-v1", learning_rate=lambda progress: 1e-2 * progress, seed=0, device="cpu", **OF_PPO)
+        model.learn(128, callback=lambda local, _: local["self"].num_timesteps < 128 * share)
+        model.save(tmp_path / f"at_{share}.zip")
+        return tmp_path / f"at_{share}.zip"
+
+    halfway, end = at(0.5), at(2.0)
+    inspect(monkeypatch, halfway, end, "--env", "CartPole-v1", "--output", tmp_path)
+    a, b = json.loads((tmp_path / "inspection.json").read_text())
+    assert a["churn_monitor/fresh/value_churn"] > 0
+    assert b["churn_monitor/fresh/value_churn"] == 0
+    assert "B was saved when its learning rate had come down to 0" in capsys.readouterr().out
+
+
+def test_models_with_nothing_in_common():
+    reports = []
+    for net_arch in ([8], [4]):
+        model = PPO("MlpPolicy", "CartPole-v1", policy_kwargs=dict(net_arch=net_arch), seed=0, device="cpu", **OF_PPO)
+        reports.append(inspect_model(model))
+    distances = report(reports)[-1]
+    rows = dict(zip(*(list(column.cells) for column in distances.columns), strict=True))
+    assert rows.pop("together") == ""
+    assert set(rows.values()) == {"not of the same shape"}

@@ -76,6 +76,15 @@ def test_one_by_one_where_the_objective_cannot_be_vectorised():
     assert len(calls) > 3
 
 
+def test_one_by_one_where_a_module_cannot_be_vectorised():
+    network = nn.GRU(3, 4, batch_first=True)
+    minibatches = th.randn(5, 2, 6, 3)
+    together = minibatch_gradients(network, lambda x: network(x)[0].sum(), minibatches)
+    for gradients, parameter in zip(together, network.parameters(), strict=True):
+        (expected,) = th.autograd.grad(network(minibatches[2])[0].sum(), [parameter])
+        th.testing.assert_close(gradients[2], expected)
+
+
 def test_errors_of_the_objective_are_not_taken_for_a_lack_of_vectorisation():
     network = Scale()
     with pytest.raises(RuntimeError, match="size"):
@@ -166,13 +175,31 @@ def test_q_ntk_is_that_of_the_definition():
     np.random.seed(3)
     matrix = q_ntk(model, 7)
     np.random.seed(3)
-    replay = model.replay_buffer.sample(7)
+    replay = model.replay_buffer._get_samples(np.random.permutation(40)[:7])
     vectors = []
     for observation, action in zip(replay.observations, replay.actions, strict=True):
         value = model.q_net(observation[None])[0, action.item()]
         vectors.append(th.cat([g.flatten() for g in th.autograd.grad(value, list(model.q_net.parameters()))]).double())
     expected = th.stack([th.stack([a @ b for b in vectors]) for a in vectors])
     th.testing.assert_close(matrix, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
+
+
+def test_q_ntk_draws_no_transition_twice():
+    model = DQN("MlpPolicy", "CartPole-v1", learning_starts=10, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu").learn(
+        30
+    )
+    matrix = q_ntk(model, 100)
+    assert len(matrix) == 32
+    assert len(matrix.unique(dim=0)) == 32
+
+
+def test_parameters_that_are_not_finite_end_no_training(tmp_path):
+    model = DQN("MlpPolicy", "CartPole-v1", learning_starts=10, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu")
+    with th.no_grad():
+        model.q_net.q_net[0].weight[0, 0] = float("nan")
+    model.learn(40, callback=NTKCallback(n_minibatches=5, path=tmp_path))
+    assert all(math.isnan(model.logger.name_to_value[f"ntk/{key}"]) for key in KEYS)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, CChainPPO, DQN, CChainDQN])

@@ -181,6 +181,7 @@ def test_hyperparameters(tmp_path):
         "churn_coef_min": 0,
         "reset_churn_coef": "False",
         "churn_base_loss": "actor",
+        "churn_component": "full",
     }
 
 

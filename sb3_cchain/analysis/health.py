@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_cchain.analysis.dormancy import dormant_scores, mean_activity
+from sb3_cchain.analysis.model_outputs import evaluation_mode
 from sb3_cchain.analysis.rank import effective_rank, singular_values, srank
 from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
 from sb3_cchain.common.forward_hooks import forward_hooks
@@ -28,7 +29,9 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
     Only what an optimiser of the model trains is counted, so no target network.
 
     Of the units behind each activation function on the way from the observations to the actions and values (a unit of a
-    convolution being a filter, as long as its output is not flattened):
+    convolution being a filter, as long as its output is not flattened). Activation functions are modules of PyTorch's usual
+    kinds (``common/activations.py``); what a network computes by functions, such as ``torch.relu``, is not seen, nor is a
+    network without any:
 
     - ``dormant_share``: share of the units whose score :math:`s_i = E_x|h_i(x)| / \frac{1}{H} \sum_k E_x|h_k(x)|` among the H
       of their layer is at most τ (:func:`~sb3_cchain.analysis.dormancy.dormant_scores`; Sokar et al., ICML 2023,
@@ -170,15 +173,10 @@ def _activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Ten
                 activations.setdefault(name, hidden)  # what actor and critic share is counted once
         return results
 
-    training = policy.training
-    policy.set_training_mode(False)
-    try:
-        with th.no_grad():
-            actions = watch(lambda: _act(policy, observations))
-            if hasattr(policy, "actor"):
-                watch(lambda: policy.critic(observations, actions))
-    finally:
-        policy.set_training_mode(training)
+    with th.no_grad(), evaluation_mode(policy):
+        actions = watch(lambda: _act(policy, observations))
+        if hasattr(policy, "actor"):
+            watch(lambda: policy.critic(observations, actions))
     return activations
 
 

@@ -11,9 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_cchain.common.policy_outputs import distribution_outputs, policy_outputs, policy_values
-
-# "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
-Batch = dict[str, Any]
+from sb3_cchain.common.reference_batch import Batch
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.health import group_norms, network_health, remember_initial_parameters, trained_groups
-from sb3_cchain.callbacks.random_state import unchanged_random_state
 from sb3_cchain.callbacks.training_interval import TrainingInterval
 from sb3_cchain.common.model_optimizers import model_optimizers
+from sb3_cchain.common.random_state import unchanged_random_state
 from sb3_cchain.validation import check_number
 
 
@@ -23,7 +23,8 @@ class NetworkHealth(TrainingInterval):
     - ``feature_srank``, ``feature_effective_rank``: ranks of the features, the outputs of a group's last activation function
     - ``weight_norm``: :math:`\|\theta\|_2`
     - ``distance_from_init``: :math:`\|\theta - \theta_0\|_2`. :math:`\theta_0` is what the parameters were when training with
-      this callback first started. It is kept as ``model.initial_parameters``, and so saved and loaded with the model.
+      this callback first started. It is kept as ``model.initial_parameters``, and so saved and loaded with the model, whose
+      file grows by the size of the parameters.
 
     and to which this callback adds
 
@@ -83,6 +84,10 @@ class NetworkHealth(TrainingInterval):
         self._hooks = ()
 
     def _before_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        if self.num_timesteps != self.model.num_timesteps:
+            # Left behind by training that was interrupted, in training without this callback
+            self._on_training_end()
+            return
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:

@@ -1,18 +1,22 @@
 """The empirical neural tangent kernel (NTK) of a policy or a Q-network."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DQN
+from stable_baselines3 import DQN, HerReplayBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_cchain.analysis.gradients import Objective, minibatch_gradients
+from sb3_cchain.analysis.model_outputs import evaluation_mode
 from sb3_cchain.analysis.rank import condition_number, effective_rank, singular_values, srank
+
+STATISTICS = ("srank", "effective_rank", "off_diagonal_sum", "diagonal_sum", "condition_number")
 
 
 def gram_matrix(gradients: Sequence[th.Tensor]) -> th.Tensor:
@@ -22,8 +26,12 @@ def gram_matrix(gradients: Sequence[th.Tensor]) -> th.Tensor:
     :param gradients: For each parameter ``(n, *parameter.shape)``: its part of :math:`g_1, \dots, g_n`
     :return: ``(n, n)``
     """
-    flat = [gradient.flatten(start_dim=1).double() for gradient in gradients]
-    return th.stack([part @ part.T for part in flat]).sum(dim=0)
+    n = len(gradients[0])
+    matrix = th.zeros(n, n, dtype=th.float64, device=gradients[0].device)
+    for gradient in gradients:
+        part = gradient.flatten(start_dim=1).double()
+        matrix += part @ part.T
+    return matrix
 
 
 def off_diagonal_sum(matrix: th.Tensor) -> float:
@@ -46,16 +54,20 @@ def ntk_statistics(matrix: th.Tensor, delta: float = 0.01) -> dict[str, float]:
     """
     :param matrix: An NTK
     :param delta: δ of :func:`~sb3_cchain.analysis.rank.srank`
-    :return: ``srank``, ``effective_rank``, ``off_diagonal_sum``, ``diagonal_sum`` and ``condition_number``
+    :return: ``srank``, ``effective_rank``, ``off_diagonal_sum``, ``diagonal_sum`` and ``condition_number``; not a number
+        where the matrix is not finite
     """
+    if not matrix.isfinite().all():
+        return dict.fromkeys(STATISTICS, math.nan)
     values = singular_values(matrix)
-    return {
-        "srank": srank(values, delta),
-        "effective_rank": effective_rank(values),
-        "off_diagonal_sum": off_diagonal_sum(matrix),
-        "diagonal_sum": diagonal_sum(matrix),
-        "condition_number": condition_number(values),
-    }
+    figures = (
+        srank(values, delta),
+        effective_rank(values),
+        off_diagonal_sum(matrix),
+        diagonal_sum(matrix),
+        condition_number(values),
+    )
+    return dict(zip(STATISTICS, figures, strict=True))
 
 
 def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
@@ -110,11 +122,17 @@ def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
     :math:`N(i, j) = \nabla_\theta Q_\theta(s_i, a_i)^\top \nabla_\theta Q_\theta(s_j, a_j)`.
 
     :param model: A model whose replay buffer is not empty
-    :param n_transitions: m, the size of the matrix
+    :param n_transitions: m, the size of the matrix; it is the number of time steps in the buffer where that is smaller
     :return: ``(m, m)``
     """
     assert model.replay_buffer is not None
-    replay = model.replay_buffer.sample(n_transitions, env=model._vec_normalize_env)
+    buffer = model.replay_buffer
+    # Without repetition, as equal transitions are one dimension; but a HerReplayBuffer draws goals as well as transitions
+    if isinstance(buffer, HerReplayBuffer):
+        replay: Any = buffer.sample(n_transitions, env=model._vec_normalize_env)
+    else:
+        indices = np.random.permutation(buffer.size())[:n_transitions]
+        replay = buffer._get_samples(indices, env=model._vec_normalize_env)
     # QRDQN's values are the means of quantiles
     quantile_net = getattr(model, "quantile_net", None)
 
@@ -134,14 +152,14 @@ def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
 
 
 def _ntk(network: nn.Module, objective: Objective, minibatches: Any) -> th.Tensor:
-    network.train(False)  # as in the rollout; train() switches the mode by itself
     # Vectorised convolutions take more memory and time than one minibatch after the other
     vectorize = not any(isinstance(module, nn.modules.conv._ConvNd) for module in network.modules())
     # A policy keeps its last distribution, which shall not be one of vmap's tensors
     distribution = getattr(network, "action_dist", None)
     before = dict(vars(distribution)) if distribution is not None else {}
     try:
-        return gram_matrix(minibatch_gradients(network, objective, minibatches, vectorize))
+        with evaluation_mode(network):
+            return gram_matrix(minibatch_gradients(network, objective, minibatches, vectorize))
     finally:
         if distribution is not None:
             vars(distribution).update(before)

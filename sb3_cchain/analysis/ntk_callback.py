@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch as th
 from matplotlib import style
 from matplotlib.axes import Axes
@@ -12,8 +13,8 @@ from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.ntk import ntk_statistics, policy_ntk, q_ntk
-from sb3_cchain.callbacks.random_state import unchanged_random_state
 from sb3_cchain.callbacks.training_interval import TrainingInterval
+from sb3_cchain.common.random_state import unchanged_random_state
 from sb3_cchain.validation import check_number
 
 
@@ -38,7 +39,8 @@ class NTKCallback(TrainingInterval):
 
     It acts at the end of the first rollout after which the model learns, before that update; then at the end of each rollout
     in which a multiple of ``interval`` was reached. Training is the same with and without it. It costs m forward and backward
-    passes of a minibatch, vectorised where there are no convolutions, and m times the memory of the parameters.
+    passes of a minibatch, as much as an epoch of the policy's part of the update, vectorised where there are no convolutions;
+    and m times the memory of the parameters. With large networks, take a greater ``interval``.
 
     :param n_minibatches: m, the size of the matrix; it is the rollout's size where that is smaller
     :param delta: δ
@@ -96,7 +98,7 @@ class NTKCallback(TrainingInterval):
                 self.matrix = q_ntk(self.model, self.n_minibatches)
         for name, value in ntk_statistics(self.matrix, self.delta).items():
             self.logger.record(f"ntk/{name}", value)
-        if self.picture_interval and self._n_matrices % self.picture_interval == 0:
+        if self.matrix.isfinite().all() and self.picture_interval and self._n_matrices % self.picture_interval == 0:
             figure = plot_ntk(self.matrix, f"NTK at step {self.num_timesteps}")
             self.logger.record("ntk/matrix", Figure(figure, close=False), exclude=("stdout", "log", "json", "csv"))
             if self._folder is not None:
@@ -127,6 +129,6 @@ def draw_ntk(axes: Axes, matrix: th.Tensor, title: str) -> AxesImage:
     :param title: Title
     :return: The image
     """
-    limit = matrix.abs().quantile(0.99).item()
+    limit = np.quantile(matrix.abs().cpu().numpy(), 0.99)
     axes.set(title=title, xlabel="minibatch", ylabel="minibatch")
     return axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")

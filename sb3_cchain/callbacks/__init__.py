@@ -1,6 +1,5 @@
 """Callbacks for training in continual environments, and for seeing what it does."""
 
-from sb3_cchain.callbacks.churn_monitor import ChurnMonitor
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
@@ -9,7 +8,6 @@ from sb3_cchain.callbacks.task_sync import TaskSync
 from sb3_cchain.callbacks.tensorboard_overview import TensorBoardOverview
 
 __all__ = [
-    "ChurnMonitor",
     "ContinualMetrics",
     "EpisodicRollouts",
     "RolloutNormalizedAdvantage",

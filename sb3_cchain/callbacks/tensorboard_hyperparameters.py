@@ -4,14 +4,15 @@ import inspect
 import math
 from collections.abc import Iterator
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HParam, KVWriter
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import SubprocVecEnv
-from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
+
+if TYPE_CHECKING:  # TensorBoard need not be installed
+    from torch.utils.tensorboard import SummaryWriter
 
 _SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 # Arguments that training does not depend on, and those that are named otherwise
@@ -31,7 +32,7 @@ class TensorBoardHyperparameters(KVWriter):
     :param values: Hyperparameter → value
     """
 
-    def __init__(self, writer: SummaryWriter, values: dict[str, str | float]):
+    def __init__(self, writer: "SummaryWriter", values: dict[str, str | float]):
         self._writer = writer
         self._values = values
         self._first = True
@@ -43,6 +44,8 @@ class TensorBoardHyperparameters(KVWriter):
         :param step: Environment steps made
         """
         if self._first and not any(isinstance(value, HParam) for value in key_values.values()):
+            from torch.utils.tensorboard.summary import hparams
+
             _, session_start, _ = hparams(self._values, {})
             assert self._writer.file_writer is not None
             self._writer.file_writer.add_summary(session_start)
@@ -97,7 +100,9 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, str | float]]:
 def _env_id(model: BaseAlgorithm) -> str | None:
     env = model.env
     # An environment's specification may hold what cannot be sent from another process
-    if env is None or isinstance(env.unwrapped, SubprocVecEnv) or not env.has_attr("spec"):
+    if env is None or isinstance(env.unwrapped, SubprocVecEnv):
         return None
-    spec = env.get_attr("spec", indices=0)[0]
-    return None if spec is None else spec.id
+    try:
+        return env.get_attr("spec", indices=0)[0].id
+    except Exception:  # whatever a vectorised environment of somebody's answers; its name is not worth a run
+        return None

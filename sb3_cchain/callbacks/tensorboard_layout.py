@@ -1,10 +1,13 @@
 """The charts of TensorBoard's Custom Scalars tab."""
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.logger import KVWriter
-from torch.utils.tensorboard import SummaryWriter
+
+if TYPE_CHECKING:  # TensorBoard need not be installed
+    from torch.utils.tensorboard import SummaryWriter
+
 
 # Category → title of the chart → regular expression of the tags in it, whole tags. One unit a chart.
 LAYOUT: dict[str, dict[str, str]] = {
@@ -41,7 +44,7 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Effective rank of the features": "health/feature_effective_rank(/.+)?",
         "Norm of the weights": "health/weight_norm(/.+)?",
         "Distance from initialisation": "health/distance_from_init(/.+)?",
-        "Norm of the gradient": "health/gradient_norm(/.+)?",
+        "Norm of the gradient, after clipping": "health/gradient_norm(/.+)?",
     },
     "Related methods": {
         "TRAC: scale": "trac/scale(_.+)?",
@@ -65,7 +68,7 @@ class TensorBoardLayout(KVWriter):
     :param writer: That of SB3's output for TensorBoard
     """
 
-    def __init__(self, writer: SummaryWriter):
+    def __init__(self, writer: "SummaryWriter"):
         self._writer = writer
         self._tags: set[str] = set()
         self._charts = 0

@@ -5,8 +5,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.callbacks.reference_batch import sample_batch
 from sb3_cchain.callbacks.tensorboard_overview import add_overview
+from sb3_cchain.common.reference_batch import sample_batch
 from sb3_cchain.validation import check_number
 
 

@@ -22,8 +22,9 @@ def gradient_component(churn: Sequence[th.Tensor], base: Sequence[th.Tensor], co
     """
     if component == "full":
         return list(churn)
-    inner_product = sum((c * b).sum() for c, b in zip(churn, base, strict=True))
-    squared_norm = sum(b.square().sum() for b in base)
+    # In double precision: the square of a small gradient's norm is 0 in single precision
+    inner_product = sum((c.double() * b.double()).sum() for c, b in zip(churn, base, strict=True))
+    squared_norm = sum(b.double().square().sum() for b in base)
     share = th.as_tensor(inner_product / squared_norm).nan_to_num(0.0, 0.0, 0.0)
     projection = [share * b for b in base]
     if component == "projection":
@@ -50,12 +51,15 @@ def component_backward(parameters: Sequence[th.Tensor], component: str) -> Itera
         nonlocal hook
         if hook is not None:
             hook.remove()  # of the update before; autograd.grad() cannot run with it
-        gradients = th.autograd.grad(churn_loss, parameters, allow_unused=True)
+        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        gradients = th.autograd.grad(churn_loss, trained, allow_unused=True)
         reached = [
-            (parameter, gradient) for parameter, gradient in zip(parameters, gradients, strict=True) if gradient is not None
+            (parameter, gradient) for parameter, gradient in zip(trained, gradients, strict=True) if gradient is not None
         ]
-        trained, churn = zip(*reached, strict=True)
-        hook = th.autograd.graph.register_multi_grad_hook(trained, partial(_add_component, trained, churn, component))
+        if reached:
+            reached_parameters, churn = zip(*reached, strict=True)
+            add = partial(_add_component, reached_parameters, churn, component)
+            hook = th.autograd.graph.register_multi_grad_hook(reached_parameters, add)
 
     try:
         yield backward

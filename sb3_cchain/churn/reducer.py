@@ -70,7 +70,8 @@ class ChurnReducer(nn.Module):
         if self.reference is not None:
             with th.enable_grad():
                 loss = self.loss(self._outputs[0](self.reference))
-            backward(loss)
+            if loss.requires_grad:  # not all that the outputs depend on is frozen
+                backward(loss)
         self.remember(reference)
 
     def loss(self, new_outputs: th.Tensor) -> th.Tensor:

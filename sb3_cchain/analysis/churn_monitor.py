@@ -13,10 +13,10 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.churn import churn
 from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
-from sb3_cchain.callbacks.random_state import unchanged_random_state
-from sb3_cchain.callbacks.reference_batch import map_batch, recent_observations, sample_batch
 from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.common.model_optimizers import model_optimizers
+from sb3_cchain.common.random_state import unchanged_random_state
+from sb3_cchain.common.reference_batch import map_batch, recent_observations, sample_batch
 from sb3_cchain.validation import check_number
 
 
@@ -56,6 +56,9 @@ class ChurnMonitor(BaseCallback):
 
     The networks are measured in evaluation mode. Recurrent policies take each observation as the first of an episode; maskable
     ones have the batch's action masks.
+
+    The fixed batch makes a saved model larger by its size, with images by some megabytes; with ``VecNormalize`` it keeps the
+    statistics of the moment when it was drawn.
 
     A window costs a forward pass of each batch at its beginning and at its end: with the defaults 1 to 3 % of the training
     time (PPO in Gym Control and CartPole, DQN in MinAtar and CartPole, on a CPU); with PPO's IMPALA network, whose features
@@ -123,6 +126,10 @@ class ChurnMonitor(BaseCallback):
         self._window = {}
 
     def _before_update(self, *_: Any) -> None:
+        if self.num_timesteps != self.model.num_timesteps:
+            # Left behind by training that was interrupted, in training without this callback
+            self._attached.close()
+            return
         self._close_window_if_over()
         if self._n_updates_seen % self.interval == 0:
             self._open_window(self.n_updates)

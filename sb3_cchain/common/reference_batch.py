@@ -12,8 +12,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cchain.analysis.model_outputs import Batch
 from sb3_cchain.common.replaced import replaced
+
+# "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
+Batch = dict[str, Any]
 
 
 def sample_batch(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: int) -> Batch:
