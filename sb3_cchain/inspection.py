@@ -182,7 +182,7 @@ def _distances(a: Inspection, b: Inspection) -> Table:
 
 
 def _words(name: str) -> str:
-    return "gradient norm, after clipping" if name == "gradient_norm" else name.replace("_", " ")
+    return "gradient norm, clipped" if name == "gradient_norm" else name.replace("_", " ")
 
 
 def _group(tag: str) -> str:
