@@ -1,0 +1,175 @@
+"""
+Finished runs, one small folder each, readable without this package:
+``<results>/<budget>/<suite>/<environment>/<method>/seed_<seed>/`` with
+
+- ``run.json``: what was run (:class:`Result` names the fields)
+- ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, of each evaluation
+- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRICS``; the header alone
+  where none was logged
+"""
+
+import csv
+import json
+import math
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
+
+# Of a suite, those that the paper compares in it
+METHODS = ("oracle", "vanilla", "trac", "weight_clipping", "l2_init", "layer_norm", "redo", "adam_rel", "cchain")
+METRICS = ("churn/", "churn_monitor/", "ntk/", "health/")
+METRICS_COLUMNS = ("timesteps", "name", "value")
+
+
+@dataclass(frozen=True)
+class Result:
+    """
+    One finished run, as ``run.json`` describes it, without a word of the machine that it ran on.
+
+    :param path: Its folder (not in the file)
+    :param suite: Suite
+    :param env_id: Environment id
+    :param method: One of ``METHODS``
+    :param algo: The method's name on the command line
+    :param seed: Seed
+    :param budget: Name of the budget
+    :param n_tasks: Length of the task sequence
+    :param steps_per_task: Environment steps per task
+    :param task_names: What the tasks are called
+    :param task_boundaries: Environment steps at which each task ends
+    :param hyperparameters: What the shipped YAML file says; numbers that JSON lacks as strings, ``"inf"``
+    :param command: The command, as a user would type it
+    :param versions: Versions of the packages that it depends on
+    :param git_commit: Commit of the checkout, None outside one
+    :param started: Date and time, ISO 8601, UTC
+    :param finished: Date and time, ISO 8601, UTC
+    :param seconds: Wall time
+    :param steps_per_second: Environment steps per second of it
+    :param peak_memory: Bytes resident at most, None where the system does not tell
+    """
+
+    path: Path
+    suite: str
+    env_id: str
+    method: str
+    algo: str
+    seed: int
+    budget: str
+    n_tasks: int
+    steps_per_task: int
+    task_names: list[str]
+    task_boundaries: list[int]
+    hyperparameters: dict[str, Any]
+    command: list[str]
+    versions: dict[str, str]
+    git_commit: str | None
+    started: str
+    finished: str
+    seconds: float
+    steps_per_second: float
+    peak_memory: int | None
+
+    def returns(self) -> list[dict[str, float]]:
+        """
+        :return: Rows of ``returns.csv``
+        """
+        return read_returns(self.path / "returns.csv")
+
+    def metrics(self) -> dict[str, list[tuple[int, float]]]:
+        """
+        :return: ``metrics.csv``: environment steps and values of each scalar, by its name
+        """
+        metrics: dict[str, list[tuple[int, float]]] = {}
+        with open(self.path / "metrics.csv", newline="") as file:
+            for row in csv.DictReader(file):
+                metrics.setdefault(row["name"], []).append((int(row["timesteps"]), float(row["value"])))
+        return metrics
+
+    def task_averages(self) -> list[float]:
+        """
+        :return: J(T_i) of each task: the mean over its rows of their mean return; NaN where it has none
+        """
+        averages = task_averages(self.returns())
+        return [averages.get(task, math.nan) for task in range(self.n_tasks)]
+
+
+def result_path(folder: Path, budget: str, suite: str, env_id: str, method: str, seed: int) -> Path:
+    """
+    :param folder: Folder of all results
+    :param budget: Name of the budget
+    :param suite: Suite
+    :param env_id: Environment id
+    :param method: One of ``METHODS``
+    :param seed: Seed
+    :return: Where that run's result goes
+    """
+    return folder / budget / suite / env_id.replace("/", "-") / method / f"seed_{seed}"
+
+
+def in_json(value: Any) -> Any:
+    """
+    :param value: A value read from YAML
+    :return: As JSON holds it, which knows no infinity
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): in_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [in_json(entry) for entry in value]
+    return value
+
+
+def read_result(path: Path) -> Result | None:
+    """
+    :param path: Folder of a result
+    :return: The result, None where there is none
+    """
+    file = path / "run.json"
+    return Result(path=path, **json.loads(file.read_text())) if file.exists() else None
+
+
+def read_results(folder: Path) -> list[Result]:
+    """
+    :param folder: A folder of results, of any level
+    :return: All results in it, by their paths
+    """
+    files = sorted(file for file in folder.rglob("run.json") if not file.parent.name.startswith("."))
+    return [Result(path=file.parent, **json.loads(file.read_text())) for file in files]
+
+
+def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: Iterable[Mapping[str, Any]]) -> None:
+    """
+    Write a result's folder under a hidden name beside ``result.path`` and rename it, so that there is a whole result or none,
+    whenever the process or the machine dies, and never two: a result that is there already is replaced.
+
+    :param result: What ``run.json`` says
+    :param returns: Rows of ``returns.csv``
+    :param metrics: Rows of ``metrics.csv``
+    """
+    fields = {name: in_json(value) for name, value in asdict(result).items() if name != "path"}
+    hidden = result.path.with_name(f".{result.path.name}.{uuid.uuid4().hex}")
+    hidden.mkdir(parents=True)
+    (hidden / "run.json").write_text(json.dumps(fields, indent=1, allow_nan=False) + "\n")
+    for name, columns, rows in (("returns.csv", COLUMNS, returns), ("metrics.csv", METRICS_COLUMNS, metrics)):
+        with open(hidden / name, "w", newline="") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    while True:
+        try:
+            return os.rename(hidden, result.path)
+        except OSError:
+            # A folder with something in it is not replaced by a rename
+            if not result.path.is_dir():
+                raise
+        replaced = result.path.with_name(f".{result.path.name}.{uuid.uuid4().hex}")
+        os.rename(result.path, replaced)
+        shutil.rmtree(replaced)
