@@ -3,7 +3,7 @@ Finished runs, one small folder each, readable without this package:
 ``<results>/<budget>/<suite>/<environment>/<method>/seed_<seed>/`` with
 
 - ``run.json``: what was run (:class:`Result` names the fields)
-- ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, of each evaluation
+- ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, each evaluation
 - ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRICS``; the header alone
   where none was logged
 """
@@ -15,6 +15,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,9 @@ from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 METHODS = ("oracle", "vanilla", "trac", "weight_clipping", "l2_init", "layer_norm", "redo", "adam_rel", "cchain")
 METRICS = ("churn/", "churn_monitor/", "ntk/", "health/")
 METRICS_COLUMNS = ("timesteps", "name", "value")
+
+# Of a result's fields, those that determine the run. Not the versions, which are recorded: a result of another version is one
+SETTINGS = ("env_id", "algo", "seed", "n_tasks", "steps_per_task", "hyperparameters")
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,11 @@ class Result:
     seconds: float
     steps_per_second: float
     peak_memory: int | None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What determines the run."""
+        return {name: getattr(self, name) for name in SETTINGS}
 
     def returns(self) -> list[dict[str, float]]:
         """
@@ -148,14 +157,15 @@ def read_results(folder: Path) -> list[Result]:
 def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: Iterable[Mapping[str, Any]]) -> None:
     """
     Write a result's folder under a hidden name beside ``result.path`` and rename it, so that there is a whole result or none,
-    whenever the process or the machine dies, and never two: a result that is there already is replaced.
+    whenever the process or the machine dies, and never two. A result of the same settings that is there already is left as it
+    is, one of others is replaced.
 
     :param result: What ``run.json`` says
     :param returns: Rows of ``returns.csv``
     :param metrics: Rows of ``metrics.csv``
     """
     fields = {name: in_json(value) for name, value in asdict(result).items() if name != "path"}
-    hidden = result.path.with_name(f".{result.path.name}.{uuid.uuid4().hex}")
+    hidden = _hidden(result.path)
     hidden.mkdir(parents=True)
     (hidden / "run.json").write_text(json.dumps(fields, indent=1, allow_nan=False) + "\n")
     for name, columns, rows in (("returns.csv", COLUMNS, returns), ("metrics.csv", METRICS_COLUMNS, metrics)):
@@ -165,11 +175,21 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
             writer.writerows(rows)
     while True:
         try:
+            # Fails where there is a folder with something in it
             return os.rename(hidden, result.path)
         except OSError:
-            # A folder with something in it is not replaced by a rename
             if not result.path.is_dir():
                 raise
-        replaced = result.path.with_name(f".{result.path.name}.{uuid.uuid4().hex}")
-        os.rename(result.path, replaced)
-        shutil.rmtree(replaced)
+        there = read_result(result.path)
+        if there is not None and there.settings == {name: fields[name] for name in SETTINGS}:
+            return shutil.rmtree(hidden)
+        replaced = _hidden(result.path)
+        # Missing: another process replaces it, too
+        with suppress(FileNotFoundError):
+            os.rename(result.path, replaced)
+            shutil.rmtree(replaced)
+
+
+def _hidden(path: Path) -> Path:
+    """A name of one's own beside it, which no reader looks into."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
