@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,15 @@ from typing import Any
 import numpy as np
 import yaml
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 from sb3_cchain.zoo import hyperparams_folder
 
 DONE = "done.json"
+# Whose versions determine a run
+PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class Run:
     :param env_kwargs: Further arguments of the environment, as on the command line
     :param eval_freq: Environment steps between two evaluations (ten greedy episodes of the task being trained), or -1
     :param hyperparams: What differs from the shipped hyperparameters, as on the command line
+    :param device: PyTorch device
     """
 
     algo: str
@@ -51,6 +56,7 @@ class Run:
     env_kwargs: tuple[str, ...] = ()
     eval_freq: int = -1
     hyperparams: tuple[str, ...] = ()
+    device: str = "cpu"
 
     @property
     def total_steps(self) -> int:
@@ -67,7 +73,7 @@ class Run:
         """The command after ``sb3-cchain``."""
         return [
             *("train", "--algo", self.algo, "--env", self.env_id, "--seed", str(self.seed)),
-            *("--n-timesteps", str(self.total_steps), "--num-threads", "1", "--device", "cpu"),
+            *("--n-timesteps", str(self.total_steps), "--num-threads", "1", "--device", self.device),
             *("--eval-freq", str(self.eval_freq), "--eval-episodes", "10"),
             *("--log-folder", str(self.folder), "--tensorboard-log", str(self.folder / "tensorboard"), "--verbose", "0"),
             *("--env-kwargs", f"steps_per_task:{self.steps_per_task}", *self.env_kwargs),
@@ -87,12 +93,12 @@ class Run:
         return {
             "arguments": [*arguments, *self.env_kwargs, *self.hyperparams],
             "hyperparameters": shipped_hyperparameters(self.algo, self.env_id),
-            "versions": {name: version(name) for name in ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")},
+            "versions": {name: version(name) for name in PACKAGES},
         }
 
     def start(self) -> subprocess.Popen:
         """
-        :return: The running process, whose output goes to ``log.txt``
+        :return: The running process, whose output goes to ``log.txt``. It does not outlive this one (on Linux)
         """
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
@@ -101,7 +107,7 @@ class Run:
             log.flush()
             # As many threads as --num-threads for the libraries that read the environment, too
             environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            command = [sys.executable, "-m", "sb3_cchain.zoo", *self.arguments]
+            command = [sys.executable, "-m", "benchmarks.child", str(os.getpid()), *self.arguments]
             return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
     @property
@@ -119,7 +125,7 @@ class Run:
 
     def evaluations(self) -> list[dict[str, float]]:
         """
-        :return: For each evaluation so far, environment steps, task and mean return
+        :return: For each evaluation so far, environment steps, task, number of episodes and mean return
         """
         files = list(self.folder.glob("*/*/evaluations.npz"))
         if not files:
@@ -130,10 +136,26 @@ class Run:
             {
                 "timesteps": int(steps),
                 "task_id": (int(steps) - 1) // self.steps_per_task,
+                "n_episodes": len(returns),
                 "mean_return": float(np.mean(returns)),
             }
             for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
         ]
+
+    def scalars(self, prefixes: tuple[str, ...]) -> list[dict[str, Any]]:
+        """
+        :param prefixes: Of scalars in TensorBoard
+        :return: Environment steps, name and value of all that was logged under them so far, to the six digits that a float32 has
+        """
+        rows = []
+        for folder in sorted({file.parent for file in self.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
+            logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
+            logged.Reload()
+            for name in logged.Tags()["scalars"]:
+                if name.startswith(prefixes):
+                    values = logged.Scalars(name)
+                    rows += [{"timesteps": event.step, "name": name, "value": f"{event.value:.6g}"} for event in values]
+        return rows
 
 
 def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
@@ -142,11 +164,19 @@ def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
     :param env_id: Environment id
     :return: What our YAML file says of it, if anything
     """
-    return yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text()).get(env_id)
+    return _settings(hyperparams_folder() / f"{algo}.yml").get(env_id)
 
 
-def _peak_memory(pid: int) -> int | None:
-    """Bytes that a process has had resident at most, where Linux tells it of one that is running."""
+@cache
+def _settings(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text())
+
+
+def peak_memory(pid: int) -> int | None:
+    """
+    :param pid: A running process
+    :return: Bytes that it has had resident at most, where Linux tells
+    """
     status = Path(f"/proc/{pid}/status")
     found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
     return 1024 * int(found[1]) if found else None
@@ -170,7 +200,7 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
     )
     waiting = [run for run in runs if not run.is_done]
     running: dict[Run, tuple[subprocess.Popen, float]] = {}
-    peak_memory: dict[Run, int | None] = {}
+    memory: dict[Run, int | None] = {}
     with Progress(*columns, refresh_per_second=2) as progress:
         bars = {run: progress.add_task(run.name, total=run.total_steps, start=False, status="") for run in runs}
         for run in runs:
@@ -187,14 +217,14 @@ def complete(runs: Sequence[Run], n_jobs: int = 2) -> None:
                     if rows := run.returns():
                         status = f"task {rows[-1]['task_id']:g}, return {rows[-1]['mean_return']:.0f}"
                         progress.update(bars[run], completed=rows[-1]["timesteps"], status=status)
-                    peak_memory[run] = _peak_memory(process.pid) or peak_memory.get(run)
+                    memory[run] = peak_memory(process.pid) or memory.get(run)
                     if process.poll() is None:
                         continue
                     del running[run]
                     if process.returncode != 0:
                         raise RuntimeError(f"{run.name} failed with exit code {process.returncode}, see {run.folder}/log.txt")
                     progress.update(bars[run], completed=run.total_steps)
-                    done = {"seconds": round(time.time() - start), "peak_memory": peak_memory[run], "settings": run.settings}
+                    done = {"seconds": round(time.time() - start), "peak_memory": memory[run], "settings": run.settings}
                     (run.folder / DONE).write_text(json.dumps(done, indent=1))
         finally:
             for process, _ in running.values():

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.results import METHODS
 from benchmarks.runs import Run
 from sb3_cchain import ContinualEnv
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
@@ -45,6 +46,14 @@ class Suite:
     def returns(self) -> Callable[[Run], list[dict[str, float]]]:
         """The returns that count, of a run."""
         return Run.evaluations if self.evaluates else Run.returns
+
+    @property
+    def methods(self) -> dict[str, str]:
+        """The algorithms by the names of their methods, in the order of ``METHODS``."""
+        vanilla, cchain = self.algos
+        algos = {"vanilla": vanilla, "cchain": cchain}
+        algos.update({algo.removeprefix("double_dqn_").removeprefix("ppo_"): algo for algo in self.others})
+        return {method: algos[method] for method in METHODS if method in algos}
 
     def length(self, env_id: str) -> tuple[int, int]:
         """

@@ -54,7 +54,7 @@ def test_evaluations_by_task(tmp_path):
     folder = run.folder / "ppo" / "Continual-Acrobot-v1_1"
     folder.mkdir(parents=True)
     np.savez(folder / "evaluations.npz", timesteps=[800, 1600, 2400], results=[[1.0, 3.0], [5.0, 5.0], [8.0, 0.0]])
-    assert [tuple(row.values()) for row in run.evaluations()] == [(800, 0, 2.0), (1600, 0, 5.0), (2400, 1, 4.0)]
+    assert [tuple(row.values()) for row in run.evaluations()] == [(800, 0, 2, 2.0), (1600, 0, 2, 5.0), (2400, 1, 2, 4.0)]
     assert averages_of(run, Run.evaluations) == [3.5, 4.0]
     assert markdown_table([run], Run.evaluations).splitlines()[2] == "| PPO | 0 | 3.5 | 4.0 | 3.8 |"
 

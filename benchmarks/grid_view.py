@@ -1,0 +1,143 @@
+"""The live view of a grid."""
+
+import math
+import platform
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.markup import escape
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from benchmarks.grid import Cell, Rates
+
+
+class Failure(NamedTuple):
+    """
+    Why a run failed.
+
+    :param cell: The run
+    :param reason: In one line
+    :param log: Path of its log, or of the folder of its logs
+    :param node: Name of the machine that it is on, None where that is not known
+    """
+
+    cell: Cell
+    reason: str
+    log: str
+    node: str | None = None
+
+    def __str__(self) -> str:
+        where = "" if self.node in (None, platform.node()) else f"{self.node}:"
+        return f"{self.cell.name} failed: {self.reason}; see {where}{self.log}"
+
+
+def duration(seconds: float) -> str:
+    """
+    :param seconds: A duration
+    :return: For people, in two figures or so
+    """
+    minutes = seconds / 60
+    if minutes < 1:
+        return f"{math.ceil(seconds)} s"
+    return (
+        f"{minutes:.0f} min"
+        if minutes < 90
+        else f"{minutes / 60:.1f} h" if minutes < 72 * 60 else f"{minutes / 1440:.0f} days"
+    )
+
+
+class GridView:
+    """
+    What is done, running, waiting and failed of a grid, and how long the rest will take. Ends and failures of runs are printed
+    in lines of their own, which a log file gets, too; the view itself is for a terminal.
+
+    :param waiting: The cells that are not done, in their order
+    :param n_done: How many are done already
+    :param rates: What is known of their speed
+    :param console: Where to
+    """
+
+    def __init__(self, waiting: Sequence[Cell], n_done: int, rates: Rates, console: Console):
+        self.waiting = list(waiting)
+        self.running: dict[Cell, float] = {}
+        self.failures: list[Failure] = []
+        self.n_before, self.n_done = n_done, n_done
+        self.slots = 1
+        self._rates = rates
+        # Seconds of the runs of this grid that came to their end: believed, and real
+        self._believed, self._real = 0.0, 0.0
+        self.console = console
+        self.live = Live(console=console, get_renderable=self.render, refresh_per_second=1, transient=True)
+
+    def start(self, cell: Cell) -> None:
+        """
+        :param cell: Runs from now on
+        """
+        self.waiting.remove(cell)
+        self.running[cell] = time.monotonic()
+
+    def skip(self, cell: Cell) -> None:
+        """
+        :param cell: Was done by another process
+        """
+        self.waiting.remove(cell)
+        self.n_done += 1
+
+    def finish(self, cell: Cell, seconds: float) -> None:
+        """
+        :param cell: Came to its end
+        :param seconds: That it took
+        """
+        del self.running[cell]
+        self.n_done += 1
+        self._believed += self._rates.seconds(cell)
+        self._real += seconds
+        total = self.n_done + len(self.running) + len(self.waiting) + len(self.failures)
+        left = f", {duration(self.time_left())} left" if self.running or self.waiting else ""
+        self.console.print(
+            f"{self.n_done} of {total}: {cell.name} done in {duration(seconds)}{left}", soft_wrap=True, highlight=False
+        )
+
+    def fail(self, failure: Failure) -> None:
+        """
+        :param failure: Of a run that is not tried again
+        """
+        del self.running[failure.cell]
+        self.failures.append(failure)
+        self.console.print(f"[red]{escape(str(failure))}[/red]", soft_wrap=True, highlight=False)
+
+    def time_left(self) -> float:
+        """
+        :return: Seconds: what the rest is believed to take, corrected by how long the finished runs of this grid really took, and
+            divided by the number that runs at a time
+        """
+        factor = self._real / self._believed if self._believed else 1.0
+        now = time.monotonic()
+        running = [max(factor * self._rates.seconds(cell) - (now - start), 0.0) for cell, start in self.running.items()]
+        waiting = [factor * self._rates.seconds(cell) for cell in self.waiting]
+        # The longest of those running is the least that it can be
+        return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
+
+    def render(self) -> RenderableType:
+        """
+        :return: The view at this moment
+        """
+        total = self.n_done + len(self.running) + len(self.waiting) + len(self.failures)
+        counts = Text.assemble(
+            f"{self.n_done} done ({self.n_before} before), {len(self.running)} running, {len(self.waiting)} waiting, ",
+            (f"{len(self.failures)} failed", "red" if self.failures else ""),
+            f", {duration(self.time_left())} left",
+        )
+        now = time.monotonic()
+        running = Table.grid(padding=(0, 2))
+        for cell, start in list(self.running.items())[:20]:
+            running.add_row("", cell.name, duration(now - start))
+        if len(self.running) > 20:
+            running.add_row("", f"and {len(self.running) - 20} more", "")
+        failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]
+        return Group(ProgressBar(total=max(total, 1), completed=self.n_done), counts, running, *failures)
