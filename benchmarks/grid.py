@@ -118,8 +118,8 @@ def length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
     if budget == "paper":
         return n_tasks, steps
     if suite == "gym_control":
-        # Two fifths of the tasks and of their lengths: 4 x 64 000, and 2 x 128 000 in MountainCar. Four tasks of 80 rollouts are
-        # enough for Vanilla to collapse and C-CHAIN not to (docs/results/gym_control.md), and they take 9 to 10 core-minutes at
+        # Two fifths of the tasks and of their lengths: 4 x 64 000, and 2 x 128 000 in MountainCar. Four tasks of 80 rollouts
+        # are enough for Vanilla to collapse and C-CHAIN not to (docs/results/gym_control.md), and take 9 to 10 core-minutes at
         # 500 to 430 steps per second: 72 runs (4 environments, 6 methods, 3 seeds) in less than 12 core-hours
         return n_tasks * 2 // 5, steps * 2 // 5
     # Elsewhere a tenth of the paper's steps: all its tasks, and no claim to be long enough for what the paper sees in them

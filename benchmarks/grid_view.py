@@ -41,14 +41,11 @@ def duration(seconds: float) -> str:
     :param seconds: A duration
     :return: For people, in two figures or so
     """
-    minutes = seconds / 60
-    if minutes < 1:
+    if seconds < 60:
         return f"{math.ceil(seconds)} s"
-    return (
-        f"{minutes:.0f} min"
-        if minutes < 90
-        else f"{minutes / 60:.1f} h" if minutes < 72 * 60 else f"{minutes / 1440:.0f} days"
-    )
+    if seconds < 90 * 60:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 72 * 3600 else f"{seconds / 86400:.0f} days"
 
 
 class GridView:
@@ -113,8 +110,8 @@ class GridView:
 
     def time_left(self) -> float:
         """
-        :return: Seconds: what the rest is believed to take, corrected by how long the finished runs of this grid really took, and
-            divided by the number that runs at a time
+        :return: Seconds: what the rest is believed to take, corrected by how long the finished runs of this grid really took,
+            and divided by the number that runs at a time
         """
         factor = self._real / self._believed if self._believed else 1.0
         now = time.monotonic()

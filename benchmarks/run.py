@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--method",
         nargs="+",
-        help=f"Of {', '.join(METHODS)}, in the order in which they are to run; by default all that the paper compares in the suite",
+        help=f"Of {', '.join(METHODS)}, in the order in which they are to run; by default all that the paper compares",
     )
     parser.add_argument(
         "--seeds", type=int, help="Number of seeds; by default the paper's, 6, or 12 in dmc and minatar; reduced: 3, smoke: 1"
@@ -97,8 +97,9 @@ def list_grid(grid: Sequence[Cell], results: Path, console: Console) -> None:
         steps = f"{cell.n_tasks} x {cell.steps_per_task:,}".replace(",", " ")
         console.print(f"{cell.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
     console.print(
-        f"{len(grid)} runs, {counts['done']} of them done. The other {counts['left']} take {duration(left)} on one core, by the "
-        f"rates of the results in {results}, and where there are none by those of benchmarks/grid.py.",
+        f"{len(grid)} runs, {counts['done']} of them done. The other {counts['left']} take about {duration(left)} on one core, "
+        f"by the rates of the results in {results}, and where there are none by those of benchmarks/grid.py.",
+        soft_wrap=True,
         highlight=False,
     )
     note_versions(grid, results, console)

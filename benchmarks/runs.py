@@ -145,7 +145,7 @@ class Run:
     def scalars(self, prefixes: tuple[str, ...]) -> list[dict[str, Any]]:
         """
         :param prefixes: Of scalars in TensorBoard
-        :return: Environment steps, name and value of all that was logged under them so far, to the six digits that a float32 has
+        :return: Environment steps, name and value of all that was logged under them so far, to six digits
         """
         rows = []
         for folder in sorted({file.parent for file in self.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):

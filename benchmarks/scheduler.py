@@ -7,6 +7,7 @@ import subprocess
 import time
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
@@ -129,9 +130,8 @@ def import_ray() -> Any:
     :return: The module, which is imported for the grid alone: it takes a while
     :raises ImportError: When it is not installed
     """
-    # No report of this use goes to Ray's authors; and CUDA_VISIBLE_DEVICES is left alone where no GPU is asked for
+    # No report of this use goes to Ray's authors
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
     except ImportError as error:
@@ -215,8 +215,7 @@ def complete_grid(
                 except ray.exceptions.RayError as error:
                     view.fail(_failure(cell, error, logs))
                 else:
-                    result = finished.result
-                    object.__setattr__(result, "path", cell.path(results))
+                    result = replace(finished.result, path=cell.path(results))
                     write_result(result, finished.returns, finished.metrics)
                     view.finish(cell, result.seconds)
     return view.failures
