@@ -115,8 +115,9 @@ class GridView:
         """
         factor = self._real / self._believed if self._believed else 1.0
         now = time.monotonic()
-        running = [max(factor * self._rates.seconds(cell) - (now - start), 0.0) for cell, start in self.running.items()]
-        waiting = [factor * self._rates.seconds(cell) for cell in self.waiting]
+        # Copies, for the view is drawn by a thread of its own
+        running = [max(factor * self._rates.seconds(cell) - (now - start), 0.0) for cell, start in list(self.running.items())]
+        waiting = [factor * self._rates.seconds(cell) for cell in list(self.waiting)]
         # The longest of those running is the least that it can be
         return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
 

@@ -60,6 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.dry_run:
             list_grid(grid, args.results, console)
             return 0
+        if all(cell.result(args.results) for cell in grid):
+            console.print(f"All {len(grid)} runs are done. Results: {args.results}")
+            note_versions(grid, args.results, console)
+            return 0
         ray = import_ray()
         connect(ray, args.address, args.cpus, args.gpus_per_run)
     # An extra that is not installed, or a cluster that is not there, too
@@ -97,7 +101,7 @@ def list_grid(grid: Sequence[Cell], results: Path, console: Console) -> None:
         steps = f"{cell.n_tasks} x {cell.steps_per_task:,}".replace(",", " ")
         console.print(f"{cell.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
     console.print(
-        f"{len(grid)} runs, {counts['done']} of them done. The other {counts['left']} take about {duration(left)} on one core, "
+        f"{len(grid)} runs, {counts['done']} of them done. The other {counts['left']} take {duration(left)} on a core, "
         f"by the rates of the results in {results}, and where there are none by those of benchmarks/grid.py.",
         soft_wrap=True,
         highlight=False,

@@ -1,0 +1,442 @@
+"""The grid of the paper: its cells, their results, and that neither is lost or made twice when something dies."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from benchmarks.grid import Cell, Rates, cells, length
+from benchmarks.grid_view import Failure, GridView, duration
+from benchmarks.results import METHODS, Result, in_json, read_result, read_results, write_result
+from benchmarks.run import main
+from benchmarks.runs import Run
+from benchmarks.scheduler import RETRIES, ROOT, RunFailed, complete_grid, connect, import_ray, slots, train
+from benchmarks.suites import SUITES
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+
+CELL = Cell("gym_control", "Continual/CartPole-v1", "cchain", 0, "smoke", 2, 800, ("task 0", "task 1"))
+ROWS = [
+    {"timesteps": 800, "task_id": 0, "n_episodes": 4, "mean_return": 20.0},
+    {"timesteps": 1600, "task_id": 0, "n_episodes": 2, "mean_return": 30.0},
+]
+
+
+def make_result(folder, cell=CELL, seconds=10.0, steps_per_second=160.0, **settings):
+    """As of a finished run."""
+    return Result(
+        path=cell.path(folder),
+        suite=cell.suite,
+        method=cell.method,
+        budget=cell.budget,
+        task_names=list(cell.task_names),
+        task_boundaries=[800, 1600],
+        command=["sb3-cchain", "train"],
+        versions={"sb3-cchain": "0", "stable-baselines3": "0", "gymnasium": "0", "torch": "0", "numpy": "0", "python": "0"},
+        git_commit=None,
+        started="2026-01-01T00:00:00+00:00",
+        finished="2026-01-01T00:00:10+00:00",
+        seconds=seconds,
+        steps_per_second=steps_per_second,
+        peak_memory=None,
+        **{**cell.settings, **settings},
+    )
+
+
+# --- Results ------------------------------------------------------------------------------------------------------------
+
+
+def test_results_are_read_as_they_were_written(tmp_path):
+    result = make_result(tmp_path)
+    assert result.path == tmp_path / "smoke" / "gym_control" / "Continual-CartPole-v1" / "cchain" / "seed_0"
+    write_result(result, ROWS, [{"timesteps": 800, "name": "churn/coef", "value": "1.5"}])
+    assert read_results(tmp_path) == read_results(tmp_path / "smoke") == [result] == [read_result(result.path)]
+    assert result.returns() == ROWS and result.metrics() == {"churn/coef": [(800, 1.5)]}
+    averages = result.task_averages()
+    assert averages[0] == 25.0 and averages[1] != averages[1]
+    assert sorted(file.name for file in result.path.iterdir()) == ["metrics.csv", "returns.csv", "run.json"]
+    assert (result.path / "returns.csv").read_text() == (
+        "timesteps,task_id,n_episodes,mean_return\n800,0,4,20.0\n1600,0,2,30.0\n"
+    )
+
+
+def test_json_without_infinity():
+    assert in_json({"a": float("inf"), "b": [1.5, (2,)], 3: None}) == {"a": "inf", "b": [1.5, [2]], "3": None}
+
+
+def test_a_result_is_whole_or_not_there(tmp_path, monkeypatch):
+    result = make_result(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", lambda *paths: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            write_result(result, ROWS, [])
+    # What it left is no result, and in nobody's way
+    assert len(list(result.path.parent.iterdir())) == 1 and read_results(tmp_path) == [] and CELL.result(tmp_path) is None
+    write_result(result, ROWS, [])
+    assert read_results(tmp_path) == [result]
+
+
+def test_the_first_of_equal_results_stays_and_one_of_other_settings_is_replaced(tmp_path):
+    first = make_result(tmp_path)
+    write_result(first, ROWS, [])
+    write_result(make_result(tmp_path, seconds=99.0), [], [])
+    assert read_results(tmp_path) == [first] and first.returns() == ROWS
+    other = make_result(tmp_path, steps_per_task=400)
+    write_result(other, [], [])
+    assert read_results(tmp_path) == [other] and other.returns() == []
+    assert [path.name for path in first.path.parent.iterdir()] == ["seed_0"]
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_writers_at_once_leave_one_whole_result(tmp_path, same):
+    results = [make_result(tmp_path, steps_per_task=800 if same else 100 + i) for i in range(16)]
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(lambda result: write_result(result, ROWS, []), results))
+    (written,) = read_results(tmp_path)
+    assert written in results and written.returns() == ROWS
+    assert [path.name for path in written.path.parent.iterdir()] == ["seed_0"]
+
+
+def test_a_result_counts_under_its_settings_alone(tmp_path):
+    result = make_result(tmp_path)
+    write_result(result, ROWS, [])
+    assert CELL.result(tmp_path) == result
+    for change in (dict(seed=1), dict(method="vanilla"), dict(budget="paper"), dict(n_tasks=3), dict(steps_per_task=801)):
+        assert replace(CELL, **change).result(tmp_path) is None
+    hyperparameters = {**CELL.settings["hyperparameters"], "learning_rate": 1.0}
+    write_result(make_result(tmp_path, hyperparameters=hyperparameters), ROWS, [])
+    assert CELL.result(tmp_path) is None
+
+
+# --- Cells --------------------------------------------------------------------------------------------------------------
+
+
+def test_methods():
+    assert tuple(SUITES["procgen"].methods) == METHODS
+    assert list(SUITES["gym_control"].methods.items()) == [
+        ("oracle", "ppo_oracle"),
+        ("vanilla", "ppo"),
+        ("trac", "ppo_trac"),
+        ("weight_clipping", "ppo_weight_clipping"),
+        ("l2_init", "ppo_l2_init"),
+        ("cchain", "ppo_cchain"),
+    ]
+    assert SUITES["minatar"].methods == {"oracle": "double_dqn_oracle", "vanilla": "double_dqn", "cchain": "dqn_cchain"}
+
+
+def test_cells_of_gym_control():
+    grid = cells(["gym_control"], budget="reduced")
+    assert len(grid) == len(set(grid)) == 4 * 6 * 3
+    assert [cell.seed for cell in grid] == [0] * 24 + [1] * 24 + [2] * 24
+    # A suite in 6 hours on two cores
+    assert sum(map(Rates([]).seconds, grid)) < 2 * 6 * 3600
+    grid = cells(["gym_control"], ["Continual/MountainCar-v0", "Continual/CartPole-v1"], ["cchain", "vanilla", "cchain"], 2)
+    assert [(cell.seed, cell.method, cell.env_id, cell.n_tasks, cell.steps_per_task) for cell in grid] == [
+        (seed, method, *env)
+        for seed in (0, 1)
+        for method in ("cchain", "vanilla")
+        for env in (("Continual/CartPole-v1", 10, 160_000), ("Continual/MountainCar-v0", 5, 320_000))
+    ]
+    assert grid[0].task_names == tuple(f"task {i}" for i in range(10))
+    assert len(cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
+
+
+def test_lengths():
+    assert length("gym_control", "Continual/Acrobot-v1", "reduced") == (4, 64_000)
+    assert length("gym_control", "Continual/MountainCar-v0", "reduced") == (2, 128_000)
+    assert length("minatar", "Continual/MinAtar-v0", "paper") == (3, 1_500_000)
+    assert length("minatar", "Continual/MinAtar-v0", "reduced") == (3, 150_000)
+    assert length("minatar", "Continual/MinAtar-v0", "smoke") == (2, 200)
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
+def test_cells_of_all_suites():
+    grid = cells(list(SUITES), budget="paper")
+    counts = {suite: sum(cell.suite == suite for cell in grid) for suite in SUITES}
+    assert counts == dict(gym_control=4 * 6 * 6, procgen=16 * 9 * 6, dmc=3 * 3 * 12, minatar=1 * 3 * 12)
+    assert {cell.env_id for cell in grid} == {f"Continual/{name}" for name in CONTINUAL_ENVS}
+    assert all(cell.settings["hyperparameters"] for cell in grid)
+    names = {cell.env_id: cell.task_names for cell in grid}
+    assert names["Continual/Maze-v0"] == ("level 20", "level 21", "level 22", "level 23", "level 24")
+    assert names["Continual/Dog-v0"] == ("stand", "walk", "run", "trot")
+
+
+def test_a_cell_is_the_command_that_a_user_would_type(tmp_path):
+    run = CELL.run(tmp_path)
+    assert run == Run("ppo_cchain", "Continual/CartPole-v1", 0, 2, 800, tmp_path, ("n_tasks:2", "offset_seed:0"))
+    assert "--hyperparams" not in run.arguments
+    evaluated = Cell("minatar", "Continual/MinAtar-v0", "vanilla", 3, "reduced", 3, 150_000, ())
+    assert evaluated.run(tmp_path).eval_freq == 5000
+    assert evaluated.run(tmp_path, "cuda").arguments[9:13] == ["--num-threads", "1", "--device", "cuda"]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--env", "Continual/Maze-v0"], "--env must be of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0"),
+        (["--method", "redo"], "--method must be of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
+        (["--seeds", "0"], "--seeds must be at least 1; got 0"),
+        (["--gpus-per-run", "-1"], "--gpus-per-run must be 0 or more; got -1"),
+        (["--cpus", "0"], "--cpus must be at least 1"),
+        (["--cpus", "2", "--address", "auto"], "goes without --address"),
+        ([], r'The grid needs Ray .*: pip install "sb3-cchain\[cluster\]"'),
+    ],
+)
+def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    folders = ["--results", str(tmp_path / "results"), "--logs", str(tmp_path / "logs")]
+    with pytest.raises(SystemExit) as error:
+        main(["--suite", "gym_control", *folders, *arguments])
+    assert error.value.code == 2 and re.search(message, capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_dry_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    arguments = ["--suite", "gym_control", "--env", "Continual/CartPole-v1", "--method", "vanilla", "cchain"]
+    arguments += ["--budget", "smoke", "--results", str(tmp_path)]
+    write_result(make_result(tmp_path), ROWS, [])
+    assert main([*arguments, "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == "CartPole-v1 vanilla seed 0 2 x 800 steps 4 s".split()
+    assert lines[1].split() == "CartPole-v1 cchain seed 0 2 x 800 steps done in 10 s".split()
+    assert lines[2].startswith("2 runs, 1 of them done. The other 1 take 4 s on a core")
+    assert lines[3].startswith("1 of the results are of sb3-cchain 0")
+    # Nothing to do needs no Ray
+    write_result(make_result(tmp_path, replace(CELL, method="vanilla")), ROWS, [])
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.startswith("All 2 runs are done.")
+
+
+# --- Time ---------------------------------------------------------------------------------------------------------------
+
+
+def test_rates_by_hand(tmp_path):
+    acrobot = replace(CELL, env_id="Continual/Acrobot-v1", budget="reduced")
+    paper = replace(CELL, budget="paper", n_tasks=1, steps_per_task=1000)
+    # Nothing known: 430 steps per second, 500 of Vanilla
+    assert Rates([]).seconds(paper) == pytest.approx(1000 / 430)
+    assert Rates([]).seconds(replace(paper, method="trac")) == pytest.approx(2.0)
+    results = [make_result(tmp_path, CELL, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
+    results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
+    # Of the suite, 3200 steps in 64 seconds, not of smoke runs, though of the same environment
+    assert Rates(results).seconds(paper) == pytest.approx(20.0)
+    results.append(make_result(tmp_path, replace(CELL, budget="reduced"), seconds=16.0))
+    assert Rates(results).seconds(paper) == pytest.approx(10.0)
+    assert Rates(results).seconds(CELL) == pytest.approx(1000.0)
+
+
+def test_durations():
+    assert [duration(seconds) for seconds in (0, 3.2, 61, 89 * 60, 5400, 71 * 3600, 4 * 86400)] == [
+        *("0 s", "4 s", "1 min", "89 min", "1.5 h", "71.0 h", "4 days"),
+    ]
+
+
+def test_time_left_by_hand(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    some = [replace(CELL, seed=seed, steps_per_task=4300) for seed in range(5)]  # 20 seconds each at 430 steps per second
+    console = Console(record=True, width=200)
+    view = GridView(some, n_done=3, rates=Rates([]), console=console)
+    view.slots = 2
+    assert view.time_left() == pytest.approx(50.0)
+    view.start(some[0])
+    view.start(some[1])
+    now = 115.0
+    assert view.time_left() == pytest.approx((5 + 5 + 60) / 2)
+    now = 130.0
+    view.finish(some[0], 30.0)
+    # They take one and a half times as long as was believed: nothing is left of the second
+    assert view.time_left() == pytest.approx((0 + 3 * 30) / 2)
+    view.fail(Failure(some[1], "ValueError: [no]", "/logs/log.txt", "elsewhere"))
+    view.start(some[2])
+    view.skip(some[3])
+    assert view.time_left() == pytest.approx(30.0)
+    console.print(view.render())
+    shown = console.export_text().splitlines()
+    assert shown[0] == "4 of 8: CartPole-v1 cchain seed 0 done in 30 s, 45 s left"
+    failure = "CartPole-v1 cchain seed 1 failed: ValueError: [no]; see elsewhere:/logs/log.txt"
+    assert shown[1].strip() == failure and shown[-1].strip() == failure
+    assert shown[3].strip() == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
+    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s".split()
+
+
+def test_slots_by_hand():
+    assert slots({"CPU": 8.0, "GPU": 1.0}, 0.0) == 8
+    assert slots({"CPU": 8.0, "GPU": 1.0}, 0.25) == 4
+    assert slots({"CPU": 2.0, "GPU": 1.0}, 0.1) == 2
+    assert slots({}, 0.0) == 1
+
+
+# --- Runs ---------------------------------------------------------------------------------------------------------------
+
+
+def train_smoke(suite, env_id, method, folder):
+    (cell,) = cells([suite], [env_id], [method], budget="smoke")
+    finished = train(cell, folder / "logs", git_commit="abc")
+    write_result(replace(finished.result, path=cell.path(folder / "results")), finished.returns, finished.metrics)
+    result = cell.result(folder / "results")
+    assert result is not None and result.seconds > 0 and result.git_commit == "abc" and result.started < result.finished
+    assert result.steps_per_second == pytest.approx(cell.total_steps / result.seconds, rel=0.01)
+    assert str(folder) not in (result.path / "run.json").read_text()
+    assert result.task_boundaries == [cell.steps_per_task, 2 * cell.steps_per_task]
+    return result
+
+
+def test_a_run_and_its_result(tmp_path):
+    result = train_smoke("gym_control", "Continual/CartPole-v1", "cchain", tmp_path)
+    assert [(row["timesteps"], row["task_id"]) for row in result.returns()] == [(800, 0), (1600, 1)]
+    metrics = result.metrics()
+    assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith("churn/") for name in metrics)
+    assert metrics["churn/coef"][0][0] == 800
+    assert result.command[:4] == ["sb3-cchain", "train", "--algo", "ppo_cchain"]
+    assert "logs/grid/smoke/gym_control/Continual-CartPole-v1/cchain/seed_0" in result.command
+    assert result.hyperparameters["max_grad_norm"] == "inf"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
+@pytest.mark.parametrize(
+    "suite, env_id, names",
+    [
+        ("procgen", "Continual/Starpilot-v0", ["level 20", "level 21"]),
+        ("dmc", "Continual/Walker-v0", ["stand", "walk"]),
+        ("minatar", "Continual/MinAtar-v0", ["SpaceInvaders", "Asterix"]),
+    ],
+)
+def test_runs_of_the_other_suites(suite, env_id, names, tmp_path):
+    result = train_smoke(suite, env_id, "cchain", tmp_path)
+    assert result.task_names == names
+    rows = result.returns()
+    if suite == "minatar":
+        assert [tuple(row.values())[:3] for row in rows] == [(200, 0, 10), (400, 1, 10)]
+    assert {row["task_id"] for row in rows} <= {0, 1} and rows
+
+
+def test_a_failed_run_says_why(tmp_path):
+    bad = replace(CELL, env_id="Continual/Acrobat-v1")
+    with pytest.raises(RunFailed) as error:
+        train(bad, tmp_path)
+    reason, log, _ = error.value.args
+    assert "\n" not in reason and "Acrobot-v1" in reason
+    assert Path(log).is_relative_to(bad.path(tmp_path)) and reason in Path(log).read_text()
+
+
+# --- With Ray -----------------------------------------------------------------------------------------------------------
+
+
+def trainings(folder):
+    """Ids of the training processes that log to a folder, and of their parents."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if "benchmarks.child\0" in (command := (process / "cmdline").read_text()) and str(folder) in command:
+                found[int(process.name)] = parent_of(int(process.name))
+        except OSError:
+            pass  # it has ended
+    return found
+
+
+def parent_of(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+
+
+def wait_for(condition, what, seconds=300):
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, f"no {what} in {seconds} seconds"
+        time.sleep(0.1)
+    return value
+
+
+def attempts(cell, logs):
+    return {path.name for path in cell.path(logs).glob("attempt_*")}
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+@linux
+@pytest.mark.slow
+def test_a_killed_grid_goes_on(tmp_path):
+    pytest.importorskip("ray")
+    results, logs = tmp_path / "results", tmp_path / "logs"
+    command = [sys.executable, "-m", "benchmarks.run", "--suite", "gym_control", "--env", "Continual/CartPole-v1"]
+    command += ["--method", "vanilla", "--seeds", "4", "--budget", "smoke", "--cpus", "2"]
+    command += ["--results", str(results), "--logs", str(logs)]
+    grid = cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 4, "smoke")
+    with open(tmp_path / "first.txt", "w") as output:
+        driver = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+    try:
+        training, worker = next(iter(wait_for(lambda: trainings(logs), "training").items()))
+        os.kill(worker, signal.SIGKILL)
+        wait_for(lambda: training not in trainings(logs), "end of the orphan", 30)
+        wait_for(lambda: read_results(results), "result")
+    finally:
+        driver.kill()
+        driver.wait()
+    wait_for(lambda: not trainings(logs), "end of the killed grid", 60)
+    before = {cell: (cell.path(results) / "run.json").stat().st_mtime_ns for cell in grid if cell.result(results)}
+    tried = {cell: attempts(cell, logs) for cell in grid}
+    assert 1 <= len(before) < 4
+
+    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert "4 of 4 runs are done, 0 failed" in again.stdout
+    assert sorted(result.seed for result in read_results(results)) == [0, 1, 2, 3]
+    for cell in grid:
+        assert len(read_result(cell.path(results)).returns()) == 2
+        if cell in before:  # not again
+            assert (cell.path(results) / "run.json").stat().st_mtime_ns == before[cell]
+            assert attempts(cell, logs) == tried[cell]
+        else:
+            assert len(attempts(cell, logs) - tried[cell]) == 1
+    # The run whose worker was killed, or which was killed with the driver: at least three more attempts than runs
+    assert sum(len(attempts(cell, logs)) for cell in grid) >= 4 + 1
+
+
+@linux
+@pytest.mark.slow
+def test_a_cluster_of_two_nodes_loses_one(tmp_path):
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    results, logs = tmp_path / "results", tmp_path / "logs"
+    grid = cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 3, "smoke")
+    bad = replace(CELL, env_id="Continual/Acrobat-v1")
+    ray = import_ray()
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    raylets = set()
+
+    def lose_one():
+        # A node has a core, so two trainings at a time are on two nodes
+        two = wait_for(lambda: len(found := trainings(logs)) == 2 and found, "two trainings at once")
+        raylets.update(parent_of(worker) for worker in two.values())
+        cluster.remove_node(node, allow_graceful=False)
+
+    try:
+        node = cluster.add_node(num_cpus=1)
+        with pytest.raises(ValueError, match="--gpus-per-run must be at most the GPUs that Ray finds, 0; got 0.25"):
+            connect(ray, cluster.address, None, 0.25)
+        connect(ray, cluster.address, None, 0.0)
+        accident = threading.Thread(target=lose_one)
+        accident.start()
+        failures = complete_grid(ray, [*grid, bad], results, logs, console=Console(file=open(os.devnull, "w")))
+        accident.join()
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    assert len(raylets) == 2
+    assert [result.seed for result in read_results(results)] == [0, 1, 2]
+    assert sum(len(attempts(cell, logs)) for cell in grid) == 3 + 1
+    (failure,) = failures
+    assert failure.cell == bad and "Acrobot-v1" in failure.reason and Path(failure.log).exists()
+    assert len(attempts(bad, logs)) == 1 + RETRIES
