@@ -9,6 +9,7 @@ Finished runs, one small folder each, readable without this package:
 """
 
 import csv
+import errno
 import json
 import math
 import os
@@ -141,8 +142,10 @@ def read_result(path: Path) -> Result | None:
     :param path: Folder of a result
     :return: The result, None where there is none
     """
-    file = path / "run.json"
-    return Result(path=path, **json.loads(file.read_text())) if file.exists() else None
+    try:
+        return Result(path=path, **json.loads((path / "run.json").read_text()))
+    except FileNotFoundError:
+        return None
 
 
 def read_results(folder: Path) -> list[Result]:
@@ -150,8 +153,8 @@ def read_results(folder: Path) -> list[Result]:
     :param folder: A folder of results, of any level
     :return: All results in it, by their paths
     """
-    files = sorted(file for file in folder.rglob("run.json") if not file.parent.name.startswith("."))
-    return [Result(path=file.parent, **json.loads(file.read_text())) for file in files]
+    paths = sorted(file.parent for file in folder.rglob("run.json") if not file.parent.name.startswith("."))
+    return [result for path in paths if (result := read_result(path)) is not None]
 
 
 def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: Iterable[Mapping[str, Any]]) -> None:
@@ -175,10 +178,9 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
             writer.writerows(rows)
     while True:
         try:
-            # Fails where there is a folder with something in it
             return os.rename(hidden, result.path)
-        except OSError:
-            if not result.path.is_dir():
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
         there = read_result(result.path)
         if there is not None and there.settings == {name: fields[name] for name in SETTINGS}:
