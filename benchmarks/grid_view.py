@@ -138,4 +138,6 @@ class GridView:
         if len(self.running) > 20:
             running.add_row("", f"and {len(self.running) - 20} more", "")
         failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]
-        return Group(ProgressBar(total=max(total, 1), completed=self.n_done), counts, running, *failures)
+        head = Table.grid(padding=(0, 1))
+        head.add_row(ProgressBar(total=max(total, 1), completed=self.n_done, width=20), counts)
+        return Group(head, running, *failures)

@@ -265,8 +265,8 @@ def test_time_left_by_hand(monkeypatch):
     assert shown[0] == "4 of 8: CartPole-v1 cchain seed 0 done in 30 s, 45 s left"
     failure = "CartPole-v1 cchain seed 1 failed: ValueError: [no]; see elsewhere:/logs/log.txt"
     assert shown[1].strip() == failure and shown[-1].strip() == failure
-    assert shown[3].strip() == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
-    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s".split()
+    assert shown[2].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
+    assert shown[3].split() == "CartPole-v1 cchain seed 2 0 s".split()
 
 
 def test_slots_by_hand():
