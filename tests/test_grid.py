@@ -296,7 +296,8 @@ def test_a_run_and_its_result(tmp_path):
     assert [(row["timesteps"], row["task_id"]) for row in result.returns()] == [(800, 0), (1600, 1)]
     metrics = result.metrics()
     assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith("churn/") for name in metrics)
-    assert metrics["churn/coef"][0][0] == 800
+    # SB3 writes what an update logged with the rollout after it
+    assert [steps for steps, _ in metrics["churn/coef"]] == [1600]
     assert result.command[:4] == ["sb3-cchain", "train", "--algo", "ppo_cchain"]
     assert "logs/grid/smoke/gym_control/Continual-CartPole-v1/cchain/seed_0" in result.command
     assert result.hyperparameters["max_grad_norm"] == "inf"
@@ -399,7 +400,7 @@ def test_a_killed_grid_goes_on(tmp_path):
             assert attempts(cell, logs) == tried[cell]
         else:
             assert len(attempts(cell, logs) - tried[cell]) == 1
-    # The run whose worker was killed, or which was killed with the driver: at least three more attempts than runs
+    # The run whose worker was killed
     assert sum(len(attempts(cell, logs)) for cell in grid) >= 4 + 1
 
 
