@@ -9,7 +9,7 @@ a table and learning curves. The same command goes on where it was interrupted.
 import argparse
 from pathlib import Path
 
-from benchmarks.report import report
+from benchmarks.curves import report
 from benchmarks.runs import complete
 from benchmarks.suites import SUITES, look_at
 

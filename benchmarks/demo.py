@@ -14,7 +14,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.report import plot_suite, row_of
+from benchmarks.curves import plot_suite, row_of
 from benchmarks.runs import complete
 from benchmarks.suites import SUITES, look_at
 

@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from benchmarks.report import smoothed
+from benchmarks.curves import smoothed
 from benchmarks.runs import Run, complete, shipped_hyperparameters
 from benchmarks.suites import SUITES
 

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.report import COLORS, LABELS, averages_of, cost_table, markdown_table, plot_curves, report, smoothed
+from benchmarks.curves import COLORS, LABELS, averages_of, cost_table, markdown_table, plot_curves, report, smoothed
 from benchmarks.runs import DONE, Run, complete
 from benchmarks.suites import ALL_ENVS, SUITES, Task, look_at
 from sb3_cchain.zoo import METHODS

@@ -1,4 +1,4 @@
-"""Tables and learning curves of runs."""
+"""Tables and learning curves of runs of one environment."""
 
 import math
 from collections.abc import Callable, Sequence
