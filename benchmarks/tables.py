@@ -1,0 +1,209 @@
+"""The report's tables, in Markdown."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.cells import Cell, Cells
+from benchmarks.curves import LABELS
+from benchmarks.estimates import agrees, best_two
+from benchmarks.figures import NTK, of_task
+from benchmarks.paper import AGGREGATE, Table
+from benchmarks.results import METHODS, Result
+from benchmarks.suites import SUITES
+
+MISSING = "–"
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    :param header: Names of the columns
+    :param rows: Cells
+    :return: In Markdown
+    """
+    return "\n".join(f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows])
+
+
+def algo_of(suite: str, method: str) -> str:
+    """
+    :param suite: Name of a suite
+    :param method: Name of a method
+    :return: Its name on the command line in that suite
+    """
+    vanilla, cchain = SUITES[suite].algos
+    if method in ("vanilla", "cchain"):
+        return vanilla if method == "vanilla" else cchain
+    return next(algo for algo in SUITES[suite].others if algo.endswith(f"_{method}"))
+
+
+def methods_of(cells: Cells, paper: Table) -> list[str]:
+    """
+    :param cells: Cells of a suite
+    :param paper: The paper's table
+    :return: The methods that are in either, in their order
+    """
+    return [method for method in METHODS if method in paper.methods or any(name == method for _, name in cells)]
+
+
+def lengths_table(results: Sequence[Result], paper: Table) -> str:
+    """
+    :param results: Runs of a suite
+    :param paper: The paper's table
+    :return: The budget's lengths beside the paper's, with a word on what that means
+    """
+    lengths = {result.env_id: (result.n_tasks, result.steps_per_task) for result in results}
+    rows = []
+    for env_id in paper.lengths:
+        if env_id in lengths:
+            rows.append([name_of(env_id), *(f"{n} × {steps:,}" for n, steps in (lengths[env_id], paper.lengths[env_id]))])
+    table = markdown_table(["tasks × environment steps", "here", "paper"], rows)
+    seeds = f"The paper's means are of {paper.n_seeds} seeds."
+    if all(paper.lengths[env_id] == length for env_id, length in lengths.items()):
+        return f"{table}\n\nThe lengths are the paper's. {seeds}"
+    return (
+        f"{table}\n\n{seeds} Runs of another length than the paper's are not expected to agree with its numbers: in a shorter "
+        "sequence the first task, which all methods learn alike, weighs more, and so does the time that learning takes."
+    )
+
+
+def results_table(suite: str, cells: Cells, paper: Table) -> str:
+    """
+    :param suite: Name of the suite
+    :param cells: Its cells
+    :param paper: The paper's table
+    :return: For each environment, J(T) here, its interval, the paper's and the seeds; and the aggregates
+    """
+    methods = methods_of(cells, paper)
+    means = [figure.mean for (env_id, _), figure in paper.figures.items() if env_id != AGGREGATE]
+    digits = 1 if max(map(abs, means)) >= 100 else 2
+    rows = []
+    for env_id in paper.lengths:
+        of_env = {method: cells[env_id, method] for method in methods if (env_id, method) in cells}
+        marks = best_two({method: cell.mean for method, cell in of_env.items()})
+        paper_marks = best_two(paper.means(env_id))
+        here, interval, printed, seeds = [name_of(env_id), "here"], ["", "95 % interval"], ["", "paper"], ["", "seeds"]
+        for method in methods:
+            cell, figure = of_env.get(method), paper.figures.get((env_id, method))
+            here.append(MISSING)
+            interval.append(MISSING)
+            seeds.append(MISSING)
+            if cell is not None:
+                sign = ""
+                if cell.interval is not None:
+                    interval[-1] = f"[{cell.interval[0]:.{digits}f}, {cell.interval[1]:.{digits}f}]"
+                    if figure is not None:
+                        sign = " ✓" if agrees(cell.interval, figure.mean, figure.standard_error) else " ✗"
+                different = " †" if len(cell.versions) > 1 else ""
+                here[-1] = _marked(cell.mean, cell.error, digits, marks.get(method)) + sign + different
+                seeds[-1] = listed(cell.seeds)
+            printed.append(_marked(figure.mean, figure.standard_error, digits, paper_marks.get(method)) if figure else MISSING)
+        rows += [here, interval, printed, seeds] if of_env else [here, printed]
+    if printed_sums := paper.means(AGGREGATE):
+        rows += [
+            ["aggregate", "here", *_sums(aggregates(cells, methods, paper), methods, digits)],
+            ["", "paper", *_sums(printed_sums, methods, digits)],
+        ]
+    return markdown_table(["J(T)", "", *(LABELS[algo_of(suite, method)] for method in methods)], rows)
+
+
+def aggregates(cells: Cells, methods: Sequence[str], paper: Table) -> dict[str, float]:
+    """
+    :param cells: Cells of a suite
+    :param methods: Methods
+    :param paper: The paper's table
+    :return: The sum over all environments of the paper's table of the means, of those methods that have them all
+    """
+    complete = [method for method in methods if all((env_id, method) in cells for env_id in paper.lengths)]
+    return {method: sum(cells[env_id, method].mean for env_id in paper.lengths) for method in complete}
+
+
+def mark_differences(suite: str, paper: Table) -> list[str]:
+    """
+    :param suite: Name of the suite
+    :param paper: The paper's table
+    :return: Where its marks are not those of its numbers, and its aggregates not the sums of its cells, by more than rounding
+    """
+    differences = []
+    for (env_id, method), figure in paper.figures.items():
+        means = paper.means(env_id)
+        name, label = "Aggregate" if env_id == AGGREGATE else name_of(env_id), LABELS[algo_of(suite, method)]
+        if best_two(means).get(method, "") != figure.mark:
+            rank = 1 + sum(mean > figure.mean for other, mean in means.items() if other != "oracle")
+            marked = f"marked as {figure.mark}" if figure.mark else "not marked"
+            differences.append(f"- {name}: {label} is {marked}; by its mean it is number {rank} (without the Oracle).")
+        if env_id == AGGREGATE:
+            total = sum(paper.figures[one, method].mean for one in paper.lengths)
+            if abs(total - figure.mean) > 0.01:
+                differences.append(f"- {name}: {label} is printed as {figure.mean}; its cells sum to {total:.3f}.")
+    return differences
+
+
+def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.ndarray], dict[str, list[int]]]:
+    """
+    The part of a table that can be summed up over environments: those in which both Vanilla and C-CHAIN have runs, and the
+    methods and seeds that are in all of these.
+
+    :param cells: Cells of a suite
+    :param paper: The paper's table
+    :return: Environments; J(T) of each method, ``(n_seeds, n_environments)``; and each method's seeds
+    """
+    env_ids = [env_id for env_id in paper.lengths if {(env_id, "vanilla"), (env_id, "cchain")} <= set(cells)]
+    matrices, seeds_of = {}, {}
+    for method in METHODS:
+        of_method: list[Cell | None] = [cells.get((env_id, method)) for env_id in env_ids]
+        complete = [cell for cell in of_method if cell is not None]
+        if not complete or len(complete) < len(env_ids):
+            continue
+        seeds = sorted(set.intersection(*(set(cell.seeds) for cell in complete)))
+        if seeds:
+            by_seed = [dict(zip(cell.seeds, cell.scores, strict=True)) for cell in complete]
+            matrices[method] = np.array([[scores[seed] for scores in by_seed] for seed in seeds])
+            seeds_of[method] = seeds
+    return env_ids, matrices, seeds_of
+
+
+def ntk_table(results: Sequence[Result]) -> str:
+    """
+    :param results: Runs in one environment whose NTK was logged
+    :return: Of each quantity and method, its mean over the logs of each task and over the seeds
+    """
+    rows = []
+    for quantity in NTK:
+        for method in METHODS:
+            runs = [result for result in results if result.method == method]
+            per_seed = []
+            for result in runs:
+                series = np.array(result.metrics().get(quantity.name, [])).reshape(-1, 2).T
+                in_tasks = [of_task((series[0], series[1]), result.task_boundaries, i)[1] for i in range(result.n_tasks)]
+                per_seed.append([values.mean() if len(values) else math.nan for values in in_tasks])
+            if runs:
+                means = [MISSING if math.isnan(mean) else f"{mean:.3g}" for mean in np.mean(per_seed, axis=0)]
+                rows.append([quantity.label, LABELS[runs[0].algo], listed(sorted(run.seed for run in runs)), *means])
+    return markdown_table(["", "method", "seeds", *results[0].task_names], rows)
+
+
+def _sums(sums: Mapping[str, float], methods: Sequence[str], digits: int) -> list[str]:
+    marks = best_two(sums)
+    return [_marked(sums[method], None, digits, marks.get(method)) if method in sums else MISSING for method in methods]
+
+
+def _marked(mean: float, error: float | None, digits: int, mark: str | None) -> str:
+    text = f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
+    return {None: "{}", "best": "**{}**", "second": "<ins>{}</ins>"}[mark].format(text)
+
+
+def name_of(env_id: str) -> str:
+    """
+    :param env_id: Environment id
+    :return: For people
+    """
+    return env_id.removeprefix("Continual/")
+
+
+def listed(seeds: Sequence[int]) -> str:
+    """
+    :param seeds: Seeds
+    :return: As text
+    """
+    return " ".join(map(str, seeds))

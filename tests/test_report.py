@@ -1,0 +1,413 @@
+"""The report: its statistics by hand, and whole reports of small made-up results."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks.cells import cells_of
+from benchmarks.estimates import (
+    agrees,
+    best_two,
+    bootstrap_interval,
+    mean_and_error,
+    normalized,
+    probability_of_improvement,
+    reliable_metrics,
+)
+from benchmarks.figures import band, of_task
+from benchmarks.page import html_page
+from benchmarks.paper import read_tables
+from benchmarks.report import main, write_report
+from benchmarks.results import Result, read_results, result_path, write_result
+from benchmarks.suites import ALL_ENVS, SUITES
+from benchmarks.tables import aggregates, algo_of, mark_differences, ntk_table, results_table, score_matrices
+
+ACROBOT, CARTPOLE = "Continual/Acrobot-v1", "Continual/CartPole-v1"
+VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    monkeypatch.setattr("benchmarks.estimates.N_RESAMPLES", 100)
+
+
+def write(folder, method, returns, env_id=ACROBOT, seed=0, metrics=(), **fields):
+    """A run of two tasks of 100 steps, with one rollout for each of the returns of a task."""
+    of_tasks = dict(enumerate(returns))
+    result = Result(
+        **{
+            "path": result_path(folder, "smoke", "gym_control", env_id, method, seed),
+            "suite": "gym_control",
+            "env_id": env_id,
+            "method": method,
+            "algo": algo_of("gym_control", method),
+            "seed": seed,
+            "budget": "smoke",
+            "n_tasks": 2,
+            "steps_per_task": 100,
+            "task_names": ["task 0", "task 1"],
+            "task_boundaries": [100, 200],
+            "hyperparameters": {"learning_rate": 1e-3},
+            "command": ["sb3-cchain", "train"],
+            "versions": VERSIONS,
+            "git_commit": None,
+            "started": "2026-01-01T00:00:00+00:00",
+            "finished": "2026-01-01T01:00:00+00:00",
+            "seconds": 3600.0,
+            "steps_per_second": 1.0,
+            "peak_memory": None,
+            **fields,
+        }
+    )
+    rows = [
+        {"timesteps": 100 * task + 10 * (i + 1), "task_id": task, "n_episodes": 1, "mean_return": value}
+        for task, values in of_tasks.items()
+        for i, value in enumerate(values)
+    ]
+    write_result(result, rows, [dict(zip(("timesteps", "name", "value"), row, strict=True)) for row in metrics])
+
+
+def cells_in(folder):
+    return cells_of(read_results(folder))[0]
+
+
+def table_rows(table):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+
+
+# Statistics
+
+
+def test_mean_and_error_by_hand():
+    # Deviations -2, 0, 2: variance 8 / 2
+    assert mean_and_error([1.0, 3.0, 5.0]) == (3.0, pytest.approx(2 / 3**0.5))
+    assert mean_and_error([7.0]) == (7.0, None)
+
+
+def test_bootstrap_interval_by_hand():
+    assert bootstrap_interval([1.0]) is None
+    assert bootstrap_interval([4.0, 4.0]) == (4.0, 4.0)
+    # Each seed alone makes up 1/4 or 1/27 of the resamples, more than 2.5 %
+    assert bootstrap_interval([3.0, 1.0]) == (1.0, 3.0)
+    assert bootstrap_interval([1.0, 5.0, 2.0]) == (1.0, 5.0)
+    # The mean times 4 is binomial(4, 1/4): 0 has 31.6 %, 3 and more 5.1 %, 4 0.4 %
+    assert bootstrap_interval([0.0, 0.0, 0.0, 1.0]) == (0.0, 0.75)
+    # Many seeds: close to mean ± 1.96 standard errors
+    scores = np.random.default_rng(1).normal(size=400)
+    mean, error = mean_and_error(scores)
+    assert bootstrap_interval(scores) == pytest.approx((mean - 1.96 * error, mean + 1.96 * error), abs=0.1 * error)
+
+
+def test_agreement_is_overlap():
+    assert agrees((1.0, 2.0), 3.0, 0.5) and agrees((4.0, 5.0), 3.0, 0.5) and agrees((0.0, 9.0), 3.0, 0.1)
+    assert not agrees((1.0, 1.9), 3.0, 0.5) and not agrees((4.1, 5.0), 3.0, 0.5)
+
+
+def test_best_two():
+    assert best_two({"oracle": 9.0, "vanilla": 1.0, "trac": 3.0, "cchain": 2.0}) == {"trac": "best", "cchain": "second"}
+    assert best_two({"oracle": 9.0, "vanilla": 1.0, "cchain": 2.0}) == {"cchain": "best"}
+    assert best_two({"oracle": 9.0, "vanilla": 1.0}) == best_two({}) == {}
+    assert best_two({"vanilla": 2.0, "trac": 2.0, "cchain": 1.0}) == {"vanilla": "best", "trac": "best"}
+
+
+def test_normalized_by_hand():
+    scores = normalized(np.array([[0.0, 5.0], [3.0, 10.0]]), np.array([-1.0, 5.0]), np.array([1.0, 15.0]))
+    assert scores.tolist() == [[0.5, 0.0], [2.0, 0.5]]
+
+
+def test_reliable_metrics_by_hand():
+    # Environments' means 0.2, 0.4, 0.6 and 2.0; the 4 scores in the middle 0.3, 0.5, 0.4, 0.8; without what is above 1, 0.575
+    scores = np.array([[0.1, 0.3, 0.4, 1.5], [0.3, 0.5, 0.8, 2.5]])
+    estimates, intervals = reliable_metrics({"a": scores, "b": np.ones((2, 4))})
+    middle = np.sort(scores.flatten())[2:6].mean()
+    assert estimates["a"] == pytest.approx([0.8, 0.5, middle, 1 - np.minimum(scores, 1).mean()])
+    assert estimates["b"].tolist() == [1.0, 1.0, 1.0, 0.0]
+    assert intervals["b"].tolist() == [[1.0, 1.0, 1.0, 0.0]] * 2
+    assert (intervals["a"][0] < estimates["a"]).all() and (estimates["a"] < intervals["a"][1]).all()
+
+
+def test_intervals_repeat_and_leave_the_generator_alone():
+    scores = {"a": np.random.default_rng(0).normal(size=(3, 2)), "cchain": np.random.default_rng(1).normal(size=(4, 2))}
+    np.random.seed(5)
+    first = reliable_metrics(scores)[1]["a"].tolist(), probability_of_improvement(scores, "cchain")
+    after = np.random.rand()
+    assert first == (reliable_metrics(scores)[1]["a"].tolist(), probability_of_improvement(scores, "cchain"))
+    np.random.seed(5)
+    assert after == np.random.rand()
+
+
+def test_probability_of_improvement_by_hand():
+    # First environment: of the pairs 2 > 1, 2 = 2, 4 > 1, 4 > 2; second: 0 < 1, 0 < 1, 1 = 1, 1 = 1
+    scores = {"cchain": np.array([[2.0, 0.0], [4.0, 1.0]]), "a": np.array([[1.0, 1.0], [2.0, 1.0]])}
+    probability, interval = probability_of_improvement(scores, "cchain")["a"]
+    assert probability == (3.5 / 4 + 1 / 4) / 2
+    assert interval[0] < probability < interval[1]
+
+
+def test_probability_of_improvement_is_rliables():
+    from rliable.metrics import probability_of_improvement as of_rliable
+
+    rng = np.random.default_rng(0)
+    scores = {"cchain": rng.integers(0, 4, (3, 5)).astype(float), "a": rng.integers(0, 4, (4, 5)).astype(float)}
+    assert probability_of_improvement(scores, "cchain")["a"][0] == pytest.approx(of_rliable(scores["cchain"], scores["a"]))
+
+
+# The paper's numbers
+
+
+def test_the_papers_tables_are_whole():
+    tables = read_tables()
+    assert {suite: len(table.figures) for suite, table in tables.items()} == dict(
+        gym_control=4 * 6 + 6, procgen=16 * 9 + 9, dmc=9, minatar=2
+    )
+    assert {env_id for table in tables.values() for env_id in table.lengths} == set(ALL_ENVS)
+    assert {suite: table.n_seeds for suite, table in tables.items()} == dict(gym_control=6, procgen=6, dmc=12, minatar=12)
+    figure = tables["procgen"].figures["Continual/BossFight-v0", "trac"]
+    assert (figure.mean, figure.standard_error, figure.mark) == (4.722, 1.027, "second")
+    for suite, table in tables.items():
+        assert set(table.methods) <= {"vanilla", "cchain", *(algo.split("_", 1)[1] for algo in SUITES[suite].others)}
+
+
+def test_the_papers_lengths_are_those_of_the_environments():
+    lengths = read_tables()["gym_control"].lengths
+    assert lengths == {env_id: SUITES["gym_control"].length(env_id) for env_id in lengths}
+    assert read_tables()["minatar"].lengths == {"Continual/MinAtar-v0": (3, 1_500_000)}
+    assert read_tables()["dmc"].lengths["Continual/Dog-v0"] == (4, 1_000_000)
+    assert set(read_tables()["procgen"].lengths.values()) == {(5, 2_000_000)}
+
+
+def test_where_the_papers_marks_are_not_its_numbers():
+    tables = read_tables()
+    assert mark_differences("gym_control", tables["gym_control"]) == [
+        "- CartPole-v1: TRAC is not marked; by its mean it is number 2 (without the Oracle).",
+        "- CartPole-v1: C-CHAIN PPO is marked as second; by its mean it is number 3 (without the Oracle).",
+    ]
+    # Sums of the printed cells by hand
+    assert mark_differences("procgen", tables["procgen"]) == [
+        "- Aggregate: L2 Init is printed as 72.961; its cells sum to 72.525.",
+        "- Aggregate: AdamRel is printed as 61.443; its cells sum to 61.749.",
+        "- Aggregate: C-CHAIN PPO is printed as 101.792; its cells sum to 102.254.",
+    ]
+    assert mark_differences("dmc", tables["dmc"]) == mark_differences("minatar", tables["minatar"]) == []
+
+
+# Cells and tables
+
+
+def test_cells_by_hand(tmp_path):
+    # J(T_0) = -15, J(T_1) = -40
+    write(tmp_path, "cchain", [[-10, -20], [-40]], seed=3)
+    write(tmp_path, "cchain", [[0], [0]], seed=1)
+    cell = cells_in(tmp_path)[ACROBOT, "cchain"]
+    assert cell.seeds == [1, 3] and cell.scores == (0.0, -27.5)
+    assert (cell.mean, cell.error, cell.interval) == (-13.75, pytest.approx(13.75), (-27.5, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [(dict(hyperparameters={"learning_rate": 1.0}), "hyperparameters"), (dict(steps_per_task=50), "steps_per_task")],
+)
+def test_other_settings_are_refused(tmp_path, fields, name):
+    write(tmp_path, "cchain", [[0], [0]])
+    write(tmp_path, "cchain", [[0], [0]], seed=1, **fields)
+    with pytest.raises(ValueError, match=f"must not differ in `{name}`: .*seed_0 and .*seed_1"):
+        cells_in(tmp_path)
+
+
+def test_other_lengths_in_an_environment_are_refused(tmp_path):
+    write(tmp_path, "cchain", [[0], [0]])
+    write(tmp_path, "vanilla", [[0]], n_tasks=1)
+    with pytest.raises(ValueError, match=r"must not differ in `n_tasks`: .*cchain.* and .*vanilla.* have 2 and 1"):
+        cells_in(tmp_path)
+
+
+def test_a_seed_that_is_there_twice_is_refused(tmp_path):
+    write(tmp_path / "one", "cchain", [[0], [0]])
+    write(tmp_path / "two", "cchain", [[0], [0]])
+    with pytest.raises(ValueError, match="Seed 0 is there twice"):
+        cells_in(tmp_path)
+
+
+def test_a_cell_without_its_average_is_left_out_whole(tmp_path):
+    write(tmp_path, "cchain", [[-1], [-1]])
+    write(tmp_path, "cchain", [[-1], []], seed=1)
+    assert cells_of(read_results(tmp_path)) == ({}, [f"{ACROBOT}, cchain, seed 1: no return in task 1"])
+
+
+def test_table_by_hand(tmp_path):
+    for seed, value in enumerate((-100, -130)):
+        write(tmp_path, "cchain", [[value], [value]], seed=seed)
+        write(tmp_path, "trac", [[value - 100], [value - 100]], seed=seed, versions={**VERSIONS, "torch": f"2.{seed}"})
+    write(tmp_path, "vanilla", [[-300], [-400]], seed=7)
+    write(tmp_path, "oracle", [[-1], [-2]])
+    rows = table_rows(results_table("gym_control", cells_in(tmp_path), read_tables()["gym_control"]))
+    assert rows[:6] == [
+        ["J(T)", "", "Oracle", "PPO", "TRAC", "Weight clipping", "L2 Init", "C-CHAIN PPO"],
+        ["---"] * 8,
+        ["Acrobot-v1", "here", "-1.5", "-350.0", "<ins>-215.0 ± 15.0</ins> ✗ †", "–", "–", "**-115.0 ± 15.0** ✓"],
+        ["", "95 % interval", "–", "–", "[-230.0, -200.0]", "–", "–", "[-130.0, -100.0]"],
+        [
+            *("", "paper", "-125.7 ± 8.3", "-372.7 ± 3.3", "-166.6 ± 8.9", "**-118.8 ± 13.4**"),
+            *("-134.0 ± 14.3", "<ins>-119.2 ± 6.9</ins>"),
+        ],
+        ["", "seeds", "0", "7", "0 1", "–", "–", "0 1"],
+    ]
+    assert rows[6] == ["CartPole-v1", "here", *["–"] * 6]
+    # By the numbers, and not as printed
+    assert rows[7][4:] == ["<ins>217.4 ± 26.3</ins>", "154.3 ± 16.0", "**266.1 ± 5.3**", "160.4 ± 14.6"]
+    assert rows[-2:] == [
+        ["aggregate", "here", *["–"] * 6],
+        ["", "paper", "-147.3", "-1157.0", "-407.3", "-291.0", "<ins>-244.0</ins>", "**-221.2**"],
+    ]
+
+
+def test_aggregate_of_complete_methods_by_hand(tmp_path):
+    paper = read_tables()["gym_control"]
+    for i, env_id in enumerate(paper.lengths):
+        write(tmp_path, "cchain", [[i], [2 * i]], env_id=env_id)
+        write(tmp_path, "vanilla", [[1], [1]], env_id=env_id)
+    write(tmp_path, "trac", [[1], [1]])
+    cells = cells_in(tmp_path)
+    assert aggregates(cells, ["vanilla", "trac", "cchain"], paper) == {"vanilla": 4.0, "cchain": 9.0}
+    assert table_rows(results_table("gym_control", cells, paper))[-2] == [
+        "aggregate",
+        "here",
+        "–",
+        "4.0",
+        "–",
+        "–",
+        "–",
+        "**9.0**",
+    ]
+
+
+def test_what_is_complete_over_environments(tmp_path):
+    for env_id in (ACROBOT, CARTPOLE):
+        for seed in (0, 1):
+            write(tmp_path, "cchain", [[seed], [seed]], env_id=env_id, seed=seed)
+        write(tmp_path, "vanilla", [[5], [5]], env_id=env_id, seed=2)
+    write(tmp_path, "vanilla", [[5], [5]], seed=3)
+    write(tmp_path, "trac", [[1], [1]])
+    write(tmp_path, "cchain", [[1], [1]], env_id="Continual/MountainCar-v0")
+    env_ids, scores, seeds = score_matrices(cells_in(tmp_path), read_tables()["gym_control"])
+    assert env_ids == [ACROBOT, CARTPOLE] and seeds == {"vanilla": [2], "cchain": [0, 1]}
+    assert {name: matrix.tolist() for name, matrix in scores.items()} == {
+        "vanilla": [[5.0, 5.0]],
+        "cchain": [[0.0, 0.0], [1.0, 1.0]],
+    }
+
+
+def test_ntk_table_by_hand(tmp_path):
+    write(tmp_path, "cchain", [[0], [0]], metrics=[(50, "ntk/srank", 2.0), (100, "ntk/srank", 4.0), (150, "ntk/srank", 9.0)])
+    write(tmp_path, "cchain", [[0], [0]], seed=1, metrics=[(50, "ntk/srank", 5.0), (150, "ntk/srank", 1.0)])
+    assert table_rows(ntk_table(read_results(tmp_path)))[2] == ["srank", "C-CHAIN PPO", "0 1", "4", "5"]
+
+
+# Pictures and page
+
+
+def test_band_by_hand():
+    curves = [(np.array([0.0, 2.0]), np.array([0.0, 2.0])), (np.array([1.0, 3.0]), np.array([3.0, 3.0]))]
+    grid, mean, low, high = band(curves)
+    assert (grid[0], grid[-1]) == (1.0, 2.0)
+    # Values 1 and 3, then 2 and 3: standard errors 1 and 0.5
+    assert (mean[0], low[0], high[0]) == pytest.approx((2.0, 1.0, 3.0))
+    assert (mean[-1], low[-1], high[-1]) == pytest.approx((2.5, 2.0, 3.0))
+    _, mean, low, high = band([(np.array([0.0, 2.0]), np.array([value, value])) for value in (1.0, 100.0)], logarithmic=True)
+    assert (mean[0], low[0], high[0]) == pytest.approx((10.0, 1.0, 100.0))
+    _, mean, low, high = band(curves[:1])
+    assert (low == mean).all() and (high == mean).all()
+
+
+def test_the_step_that_ends_a_task_is_of_that_task():
+    steps, values = of_task((np.array([50, 100, 101, 200]), np.arange(4.0)), [100, 200], 0)
+    assert steps.tolist() == [50, 100] and values.tolist() == [0.0, 1.0]
+
+
+def test_page_needs_nothing_beside_it(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"picture")
+    page = html_page(
+        "# A title\n\n## Over `all` environments\n\n![words](a.png)\n\n| a | b |\n| --- | --- |\n| **1** | 2 |\n", tmp_path
+    )
+    assert '<h2 id="over-all-environments">' in page and "<title>A title</title>" in page
+    assert 'src="data:image/png;base64,cGljdHVyZQ=="' in page and 'alt="words"' in page
+    assert "<td><strong>1</strong></td>" in page
+    assert not re.search(r"https?://|<script", page)
+
+
+def make_results(folder):
+    ntk = [
+        (steps, name, value)
+        for steps, value in ((50, 2.0), (100, 3.0), (150, 4.0), (200, 5.0))
+        for name in ("ntk/srank", "ntk/off_diagonal_sum", "ntk/diagonal_sum")
+    ]
+    for env_id in (ACROBOT, CARTPOLE):
+        for seed in (0, 1):
+            write(folder, "cchain", [[-90 - seed, -80], [-100, -90]], env_id=env_id, seed=seed, metrics=ntk)
+            write(folder, "vanilla", [[-90, -80 - seed], [-400, -400]], env_id=env_id, seed=seed)
+    write(folder, "oracle", [[-90, -80], [-100]])
+
+
+def test_whole_report(tmp_path, monkeypatch):
+    make_results(tmp_path / "results")
+    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path / "results"), "--budget", "smoke"])
+    main()
+    folder = tmp_path / "results" / "smoke"
+    text, page = (folder / "report.md").read_text(), (folder / "report.html").read_text()
+    assert "budget `smoke`" in text and "9 finished runs of 2 seeds" in text
+    assert "- Not run: Continual ProcGen, Continual DeepMind Control, Continual MinAtar." in text
+    assert "5 of the paper's 24 cells have runs. Of the 4 with more than one seed, 0 agree with the paper." in text
+    assert "| Acrobot-v1 | 2 × 100 | 10 × 160,000 |" in text and "not expected to agree" in text
+    assert "Left out, as they do not have runs in all of them: Oracle, TRAC, Weight clipping, L2 Init." in text
+    assert "| PPO | 1.00 [1.00, 1.00] | 2 of 2 | 2 of 2 |" in text
+    assert "9 runs, 9.0 hours" in text and not re.search(r"\bnan\b|None", text)
+    pictures = sorted(re.findall(r"\]\((pictures/.*?)\)", text))
+    assert pictures == sorted(str(path.relative_to(folder)) for path in folder.glob("pictures/*.png"))
+    assert len(pictures) == 5 and page.count("data:image/png;base64,") == 5
+    # Every anchor has its heading
+    assert set(re.findall(r'href="#(.*?)"', page)) == {"continual-gym-control"} <= set(re.findall(r'id="(.*?)"', page))
+    assert not re.search(r"https?://|<script", page)
+    # Beside the results, it is not one of them
+    assert len(read_results(tmp_path / "results")) == 9
+
+
+def test_report_of_a_single_seed(tmp_path):
+    for method in ("vanilla", "cchain"):
+        write(tmp_path, method, [[-90], [-100]])
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "| Acrobot-v1 | here | – | **-95.0** | – | – | – | **-95.0** |" in text
+    assert "| C-CHAIN PPO | 0 | 1.09 | 1.09 | 1.09 | 0.00 |" in text and "| PPO | 0.50 | 0 of 1 | 1 of 1 |" in text
+    assert not (tmp_path / "out" / "pictures" / "metrics_gym_control.png").exists()
+
+
+def test_report_of_a_method_alone(tmp_path):
+    write(tmp_path, "trac", [[-90], []])
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert f"Left out, as their J(T) is not defined:\n\n- {ACROBOT}, trac, seed 0: no return in task 1" in text
+    assert "Over the environments" not in text and "Neural" not in text
+
+
+def test_versions_that_differ_are_told(tmp_path):
+    write(tmp_path, "trac", [[-90], [-90]])
+    write(tmp_path, "trac", [[-90], [-90]], seed=1, versions={**VERSIONS, "torch": "2.9.0"})
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    told = "- † Acrobot-v1, TRAC: seeds 0 with torch 2.8.0; seeds 1 with torch 2.9.0"
+    assert told in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_a_budget_that_is_not_there(tmp_path, monkeypatch, capsys):
+    make_results(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main()
+    assert "no results of --budget reduced" in capsys.readouterr().err
+
+
+def test_an_environment_that_the_paper_does_not_have_is_refused(tmp_path):
+    write(tmp_path, "cchain", [[-90], [-90]], env_id="Continual/Pendulum-v1")
+    with pytest.raises(ValueError, match=r"no Continual/Pendulum-v1 in suite 'gym_control': .*seed_0"):
+        write_report(read_results(tmp_path), "smoke", tmp_path / "out")
