@@ -15,8 +15,8 @@ BUDGETS = ("paper", "reduced", "smoke")
 SEEDS = {"paper": 6, "reduced": 3, "smoke": 1}
 PAPER_SEEDS = {"dmc": 12, "minatar": 12}
 
-# Two tasks of one or two rollouts, or of an evaluation
-SMOKE_STEPS = {"gym_control": 800, "procgen": 1000, "dmc": 2048, "minatar": 200}
+# Of two tasks, in a rollout each (both in one in ProcGen), or with an evaluation each
+SMOKE_STEPS = {"gym_control": 800, "procgen": 500, "dmc": 2048, "minatar": 200}
 
 # Environment steps per second of Vanilla and of C-CHAIN, on one core: what is believed as long as there are no results.
 # gym_control: Acrobot on a quiet machine of two cores, and 1.17 times as long for C-CHAIN (docs/results/speed.md).

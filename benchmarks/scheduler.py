@@ -3,6 +3,7 @@
 import os
 import platform
 import signal
+import socket
 import subprocess
 import time
 import uuid
@@ -148,8 +149,16 @@ def connect(ray: Any, address: str | None, cpus: int | None, gpus_per_run: float
     :param address: Address of a cluster, None for this machine
     :param cpus: Cores to use on this machine, None for all
     :param gpus_per_run: GPUs of a run
+    :raises ConnectionError: When nothing answers at the address
     :raises ValueError: When there are no GPUs, which the runs would wait for
     """
+    if address is not None and ":" in address:
+        # Ray itself goes on trying for minutes
+        host, port = address.removeprefix("ray://").rsplit(":", 1)
+        try:
+            socket.create_connection((host, port), timeout=10).close()
+        except OSError as error:
+            raise ConnectionError(f"--address must be that of a Ray cluster; got {address}: {error}") from error
     options: dict[str, Any] = {"address": address}
     if address is None:
         # What runs leave is small. "local": whatever cluster runs on this machine otherwise, it is not joined

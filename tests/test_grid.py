@@ -269,6 +269,11 @@ def test_time_left_by_hand(monkeypatch):
     assert shown[3].split() == "CartPole-v1 cchain seed 2 0 s".split()
 
 
+def test_an_address_at_which_nothing_answers():
+    with pytest.raises(ConnectionError, match=r"--address must be that of a Ray cluster; got 127.0.0.1:1: .*refused"):
+        connect(None, "127.0.0.1:1", None, 0.0)
+
+
 def test_slots_by_hand():
     assert slots({"CPU": 8.0, "GPU": 1.0}, 0.0) == 8
     assert slots({"CPU": 8.0, "GPU": 1.0}, 0.25) == 4
@@ -306,15 +311,15 @@ def test_a_run_and_its_result(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
 @pytest.mark.parametrize(
-    "suite, env_id, names",
+    "suite, env_id, method, names",
     [
-        ("procgen", "Continual/Starpilot-v0", ["level 20", "level 21"]),
-        ("dmc", "Continual/Walker-v0", ["stand", "walk"]),
-        ("minatar", "Continual/MinAtar-v0", ["SpaceInvaders", "Asterix"]),
+        ("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"]),
+        ("dmc", "Continual/Walker-v0", "cchain", ["stand", "walk"]),
+        ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"]),
     ],
 )
-def test_runs_of_the_other_suites(suite, env_id, names, tmp_path):
-    result = train_smoke(suite, env_id, "cchain", tmp_path)
+def test_runs_of_the_other_suites(suite, env_id, method, names, tmp_path):
+    result = train_smoke(suite, env_id, method, tmp_path)
     assert result.task_names == names
     rows = result.returns()
     if suite == "minatar":
