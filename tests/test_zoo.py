@@ -247,7 +247,7 @@ def test_train_on_walker_with_normalisation_that_restarts(tmp_path):
 @pytest.mark.parametrize("arguments", [[], ["fly"]])
 def test_usage(monkeypatch, arguments):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
-    with pytest.raises(SystemExit, match=r"usage: sb3-cchain {train\|enjoy\|plot_train"):
+    with pytest.raises(SystemExit, match=r"usage: sb3-cchain {train\|enjoy\|inspect\|plot_train"):
         zoo.main()
 
 
