@@ -160,14 +160,14 @@ def test_policy_churn_is_the_kl_divergence():
     )
     pairs = []
 
-    def backward(reference, backward=model.churn_reducer.backward):
+    def backward(reference, add_gradient, backward=model.churn_reducer.backward):
         reducer = model.churn_reducer
         if reducer.reference is not None:
             with th.no_grad():
                 new = model.policy.get_distribution(reducer.reference).distribution
             old = th.distributions.Categorical(probs=reducer.old_outputs)
             pairs.append(th.distributions.kl_divergence(old, new).mean().item())
-        backward(reference)
+        backward(reference, add_gradient)
 
     model.churn_reducer.backward = backward
     model.learn(2 * 32)
