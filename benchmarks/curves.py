@@ -170,7 +170,7 @@ def plot_curves(
     panels[n_tasks // 2].set_xlabel("environment steps")
     handles, labels = panels[0].get_legend_handles_labels()
     legend = dict(zip(labels, handles, strict=True))
-    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 4), frameon=False)
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 3), frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
