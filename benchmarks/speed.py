@@ -21,16 +21,14 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from rl_zoo3.utils import get_class_by_name
-from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
-from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
-from sb3_cchain.analysis import NetworkHealth, NTKCallback
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.baselines import (
     TRAC,
     AdamRel,
@@ -187,52 +185,12 @@ def minatar(n_past_updates: int = 0) -> Case:
     )
 
 
-# What is looked at in training, each with its defaults. NTKCallback and NetworkHealth look at the first iteration of each
-# `learn()`, so in short rounds more often than at their intervals.
-MONITORS: dict[str, type[BaseCallback]] = {
-    "ChurnMonitor": ChurnMonitor,
-    "NTKCallback": NTKCallback,
-    "NetworkHealth": NetworkHealth,
-}
-
-
-def monitors() -> Case:
-    """
-    :return: Training with each of the callbacks that look at it, under small and large settings, over training without
-    """
-    minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
-    cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
-    # Each with the environment steps of a round
-    settings: dict[str, tuple[type[BaseAlgorithm], dict[str, Any], int]] = {
-        "PPO, Gym Control": (PPO, settings_of("ppo", "Continual/Acrobot-v1"), 2400),
-        "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 4096),
-        "DQN, MinAtar": (DQN, minatar, 500),
-        "DQN, CartPole, SB3's defaults": (DQN, cart_pole, 4000),
-    }
-    models: dict[str, Any] = {}
-    pairs = []
-    for setting, (algorithm, arguments, n_steps) in settings.items():
-        models[setting] = algorithm(**arguments), None, n_steps
-        for name, monitor in MONITORS.items():
-            models[f"{setting}, {name}"] = algorithm(**arguments), monitor(), n_steps
-            pairs.append((f"{setting}, {name}", setting))
-
-    def learn(made: Any) -> None:
-        model, callback, n_steps = made
-        model.learn(n_steps, callback=callback, reset_num_timesteps=False)
-
-    for made in models.values():
-        learn(made)
-    return Case("Monitors", models, {"learn()": learn}, pairs)
-
-
 CASES: dict[str, Callable[[], Case]] = {
     "gym_control": partial(ppo, "Continual/Acrobot-v1"),
     # One epoch, as a round would take minutes
     "procgen": partial(ppo, "Continual/Starpilot-v0", n_epochs=1),
     "dmc": partial(ppo, "Continual/Walker-v0", n_epochs=1),
     "related": related,
-    "monitors": monitors,
     "minatar": minatar,
     "minatar_later": partial(minatar, n_past_updates=50_000),
 }

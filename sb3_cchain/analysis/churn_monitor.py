@@ -60,7 +60,7 @@ class ChurnMonitor(BaseCallback):
     The fixed batch makes a saved model larger by its size, with images by some megabytes; with ``VecNormalize`` it keeps the
     statistics of the moment when it was drawn.
 
-    A window costs a forward pass of each batch at its beginning and at its end: with the defaults 1 to 3 % of the training
+    A window costs a forward pass of each batch at its beginning and at its end: with the defaults 1 to 4 % of the training
     time (PPO in Gym Control and CartPole, DQN in MinAtar and CartPole, on a CPU); with PPO's IMPALA network, whose features
     are computed for policy and value, about 5 % of the operations of ``train()``. The default interval is a prime: one that
     shares a divisor with the number of minibatches of an epoch, or with the ``policy_delay`` of TD3, meets the same few of
