@@ -1,16 +1,13 @@
 """The ablation of the churn gradient: its component along PPO's gradient, and the orthogonal one."""
 
-import inspect
-import textwrap
-
 import pytest
-import stable_baselines3.ppo.ppo
 import torch as th
 from stable_baselines3 import PPO
 
 from sb3_cchain import CChainCallback, CChainPPO
 from sb3_cchain.churn import component_backward, cross_entropy, gradient_component
 from sb3_cchain.common.policy_outputs import policy_outputs
+from tests.sb3_source import NUMBERED_MINIBATCHES, rewritten
 
 SETTINGS = dict(
     n_steps=64,
@@ -62,29 +59,17 @@ def test_added_during_the_backward_pass_of_the_base_loss():
     assert shared.grad.item() == 8.0
 
 
-def rewritten_train():
-    """SB3's ``PPO.train`` with the two gradients computed apart."""
-    source = textwrap.dedent(inspect.getsource(PPO.train))
-    for original, replacement in [
-        (
-            "for rollout_data in self.rollout_buffer.get(self.batch_size):",
-            "minibatches = list(self.rollout_buffer.get(self.batch_size))\n"
-            "        for position, rollout_data in enumerate(minibatches):",
-        ),
+class WrittenOutPPO(PPO):
+    """SB3's, with the two gradients computed apart."""
+
+    train = rewritten(
+        PPO.train,
+        NUMBERED_MINIBATCHES,
         (
             "loss.backward()",
             "self.set_gradients(loss, minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)].observations)",
         ),
-    ]:
-        assert source.count(original) == 1, f"SB3 changed `{original}`"
-        source = source.replace(original, replacement)
-    namespace = dict(vars(stable_baselines3.ppo.ppo))
-    exec(source, namespace)
-    return namespace["train"]
-
-
-class WrittenOutPPO(PPO):
-    train = rewritten_train()
+    )
     pending = None
     component = "full"
 

@@ -390,21 +390,3 @@ def test_of_an_unknown_algorithm():
     model.policy = nn.Identity()
     with pytest.raises(TypeError, match="outputs of PPO with Identity are not known"):
         ChurnMonitor().init_callback(model)
-
-
-def test_nothing_is_watched_after_an_interruption():
-    """Neither by training without the callback, nor twice by training with it."""
-    model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
-    step = model.policy.optimizer.step
-
-    def interrupted(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    model.policy.optimizer.step = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(64, callback=ChurnMonitor(interval=1))
-    model.policy.optimizer.step = step
-    assert model.policy.optimizer._optimizer_step_pre_hooks
-    model.learn(64, reset_num_timesteps=False)
-    assert not model.policy.optimizer._optimizer_step_pre_hooks
-    assert not any("churn_monitor" in key for key in model.logger.name_to_value)

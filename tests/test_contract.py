@@ -3,13 +3,9 @@ Churn reduction through the optimiser seam equals churn reduction written into t
 the seam turns these tests red, not the results wrong.
 """
 
-import inspect
-import textwrap
-
 import gymnasium as gym
 import numpy as np
 import pytest
-import stable_baselines3.ppo.ppo
 import torch as th
 from stable_baselines3 import PPO
 
@@ -17,6 +13,7 @@ from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainPPO
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.common.policy_outputs import policy_outputs
+from tests.sb3_source import NUMBERED_MINIBATCHES, rewritten
 
 N_ITERATIONS = 8
 SETTINGS = dict(
@@ -32,33 +29,21 @@ SETTINGS = dict(
 COEF = 30.0
 
 
-def rewritten_train():
-    """SB3's ``PPO.train`` with the churn term in its loss."""
-    source = textwrap.dedent(inspect.getsource(PPO.train))
-    for original, replacement in [
-        (
-            "for rollout_data in self.rollout_buffer.get(self.batch_size):",
-            "minibatches = list(self.rollout_buffer.get(self.batch_size))\n"
-            "        for position, rollout_data in enumerate(minibatches):",
-        ),
+class WrittenOutPPO(PPO):
+    """SB3's, with the churn term in its loss."""
+
+    train = rewritten(
+        PPO.train,
+        NUMBERED_MINIBATCHES,
         (
             "loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss",
             "loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss + self.churn_term()",
         ),
         (
             "self.policy.optimizer.zero_grad()",
-            "self.remember(minibatches, position)\n            self.policy.optimizer.zero_grad()",
+            "self.remember(minibatches, position)\nself.policy.optimizer.zero_grad()",
         ),
-    ]:
-        assert source.count(original) == 1, f"SB3 changed `{original}`"
-        source = source.replace(original, replacement)
-    namespace = dict(vars(stable_baselines3.ppo.ppo))
-    exec(source, namespace)
-    return namespace["train"]
-
-
-class WrittenOutPPO(PPO):
-    train = rewritten_train()
+    )
     pending = None
     n_optimizer_steps = 0
 

@@ -3,12 +3,9 @@ Double Q-learning, the loss and churn reduction around SB3's ``DQN.train()`` equ
 moves the seams turns these tests red, not the results wrong.
 """
 
-import inspect
-import textwrap
 from functools import partial
 
 import pytest
-import stable_baselines3.dqn.dqn
 import torch as th
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -17,6 +14,7 @@ from benchmarks.deepcopy_dqn import DeepCopyDQN
 from sb3_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.common import off_policy_churn
 from tests.envs import RandomEnv
+from tests.sb3_source import rewritten
 
 SETTINGS = dict(
     learning_rate=3e-3,
@@ -40,25 +38,16 @@ DOUBLE_Q = (
 )
 MSE = ("F.smooth_l1_loss(", "F.mse_loss(")
 CHURN = [
-    ("losses.append(loss.item())", "losses.append(loss.item())\n        loss = loss + self.churn_term()"),
-    ("self.policy.optimizer.zero_grad()", "self.remember(batch_size)\n        self.policy.optimizer.zero_grad()"),
+    ("losses.append(loss.item())", "losses.append(loss.item())\nloss = loss + self.churn_term()"),
+    ("self.policy.optimizer.zero_grad()", "self.remember(batch_size)\nself.policy.optimizer.zero_grad()"),
 ]
 
 
 def rewritten_dqn(*replacements):
     """SB3's DQN with its source changed."""
-    source = textwrap.dedent(inspect.getsource(DQN.train))
-    for original, replacement in replacements:
-        assert source.count(original) == 1, f"SB3 changed `{original}`"
-        indent = next(line for line in source.splitlines() if original in line)
-        indent = indent[: len(indent) - len(indent.lstrip())]
-        first, *rest = replacement.split("\n")
-        source = source.replace(original, "\n".join([first, *(indent + line.lstrip() for line in rest)]))
-    namespace = dict(vars(stable_baselines3.dqn.dqn))
-    exec(source, namespace)
 
     class WrittenOutDQN(DQN):
-        train = namespace["train"]
+        train = rewritten(DQN.train, *replacements)
         pending = None
         n_churn_terms = 0
 

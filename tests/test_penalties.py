@@ -1,32 +1,24 @@
 """Penalties left behind by zero_grad equal penalties written into the loss."""
 
-import inspect
-import textwrap
-
 import pytest
-import stable_baselines3.ppo.ppo
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from torch import nn
 
 from sb3_cchain.baselines import L2Init, Parseval
+from tests.sb3_source import rewritten
 
 COEF = 0.3
 
 
-def rewritten_train():
-    """SB3's ``PPO.train`` with a penalty in its loss."""
-    source = textwrap.dedent(inspect.getsource(PPO.train))
-    original = "loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss"
-    assert source.count(original) == 1, f"SB3 changed `{original}`"
-    namespace = dict(vars(stable_baselines3.ppo.ppo))
-    exec(source.replace(original, f"{original} + self.penalty()"), namespace)
-    return namespace["train"]
+LOSS = "loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss"
 
 
 class WrittenOutPPO(PPO):
-    train = rewritten_train()
+    """SB3's, with a penalty in its loss."""
+
+    train = rewritten(PPO.train, (LOSS, f"{LOSS} + self.penalty()"))
 
     def penalty(self):
         return COEF * PENALTIES[self.kind][1](list(self.policy.parameters()), self.initial)

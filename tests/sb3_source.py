@@ -1,0 +1,24 @@
+"""SB3's own training loops with a few lines replaced: an independent implementation to test against."""
+
+import inspect
+import sys
+import textwrap
+
+# So that a loop over minibatches knows those to come
+NUMBERED_MINIBATCHES = (
+    "for rollout_data in self.rollout_buffer.get(self.batch_size):",
+    "minibatches = list(self.rollout_buffer.get(self.batch_size))\nfor position, rollout_data in enumerate(minibatches):",
+)
+
+
+def rewritten(method, *replacements):
+    """``method`` with each original replaced, further lines at its indentation; fails when SB3 has changed one of them."""
+    source = textwrap.dedent(inspect.getsource(method))
+    for original, replacement in replacements:
+        assert source.count(original) == 1, f"SB3 changed `{original}`"
+        line = next(line for line in source.splitlines() if original in line)
+        indent = line[: len(line) - len(line.lstrip())]
+        source = source.replace(original, replacement.replace("\n", f"\n{indent}"))
+    namespace = dict(vars(sys.modules[method.__module__]))
+    exec(source, namespace)
+    return namespace[method.__name__]
