@@ -34,7 +34,7 @@ COEF = 30.0
 DOUBLE_Q = (
     "next_q_values, _ = next_q_values.max(dim=1)",
     "greedy = self.q_net(replay_data.next_observations).argmax(dim=1, keepdim=True)\n"
-    "            next_q_values = next_q_values.gather(1, greedy)",
+    "next_q_values = next_q_values.gather(1, greedy)",
 )
 MSE = ("F.smooth_l1_loss(", "F.mse_loss(")
 CHURN = [
