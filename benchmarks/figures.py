@@ -53,16 +53,27 @@ def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[np.ndarra
     return grid, back(mean), back(mean - error), back(mean + error)
 
 
-def of_task(series: Series, boundaries: Sequence[int], task: int) -> Series:
+def returns_of_task(result: Result, task: int) -> Series:
     """
-    :param series: Environment steps and values of a run
-    :param boundaries: Environment steps at which each task ends; the step itself is still of that task
-    :param task: Number of a task
-    :return: Those of the task
+    :param result: A run
+    :param task: Number of one of its tasks
+    :return: Its rows of ``returns.csv``: of a rollout in which the task changes, each task has its own, at the rollout's end
     """
-    steps, values = series
-    chosen = np.searchsorted(boundaries, steps) == task
-    return steps[chosen], values[chosen]
+    rows = [row for row in result.returns() if row["task_id"] == task]
+    return np.array([row["timesteps"] for row in rows]), np.array([row["mean_return"] for row in rows])
+
+
+def metric_of_task(result: Result, name: str, task: int) -> Series:
+    """
+    :param result: A run
+    :param name: Name of a scalar in ``metrics.csv``
+    :param task: Number of one of its tasks
+    :return: What was logged in the task: the step that ends it is still of it; of the last task, what the last rollout logged
+        beyond its end, too
+    """
+    logged = np.array(result.metrics().get(name, [])).reshape(-1, 2)
+    chosen = logged[np.searchsorted(result.task_boundaries[:-1], logged[:, 0]) == task]
+    return chosen[:, 0], chosen[:, 1]
 
 
 def plot_learning_curves(results: Sequence[Result], path: Path, window: int, own_scales: bool) -> None:
@@ -72,16 +83,11 @@ def plot_learning_curves(results: Sequence[Result], path: Path, window: int, own
     :param window: Rollouts that the running mean goes over, inside a task
     :param own_scales: Whether each task has a panel of its own, where tasks differ in the size of their returns
     """
-
-    def series(result: Result) -> Series:
-        rows = result.returns()
-        return np.array([row["timesteps"] for row in rows]), np.array([row["mean_return"] for row in rows])
-
     plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
     n_tasks = results[0].n_tasks
     figure, axes = plt.subplots(1, n_tasks if own_scales else 1, figsize=(9, 4), squeeze=False, layout="constrained")
     panels = list(axes[0]) if own_scales else [axes[0, 0]] * n_tasks
-    _draw(panels, results, series, window=window)
+    _draw(panels, results, returns_of_task, window=window)
     panels[0].set_ylabel("return per episode")
     for panel, name in zip(panels, results[0].task_names, strict=True) if own_scales else ():
         panel.set_title(name, fontsize="medium")
@@ -97,9 +103,8 @@ def plot_ntk(results: Sequence[Result], path: Path) -> None:
     figure, axes = plt.subplots(1, len(NTK), figsize=(12, 3.4), layout="constrained")
     for panel, quantity in zip(axes, NTK, strict=True):
 
-        def series(result: Result, name: str = quantity.name) -> Series:
-            logged = np.array(result.metrics().get(name, [])).reshape(-1, 2)
-            return logged[:, 0], logged[:, 1]
+        def series(result: Result, task: int, name: str = quantity.name) -> Series:
+            return metric_of_task(result, name, task)
 
         _draw([panel] * results[0].n_tasks, results, series, logarithmic=quantity.logarithmic)
         panel.set_title(quantity.label, fontsize="medium")
@@ -137,17 +142,17 @@ def plot_reliable_metrics(
 def _draw(
     panels: Sequence[Any],
     results: Sequence[Result],
-    series: Callable[[Result], Series],
+    series: Callable[[Result, int], Series],
     window: int = 1,
     logarithmic: bool = False,
 ) -> None:
     """Each task in its panel, a line and a band per method that has values there, and the switches."""
     boundaries = results[0].task_boundaries
-    by_method = {method: [series(result) for result in results if result.method == method] for method in METHODS}
+    by_method = {method: [result for result in results if result.method == method] for method in METHODS}
     algos = {result.method: result.algo for result in results}
     for task, panel in enumerate(panels):
-        for method, of_runs in by_method.items():
-            curves = [of_task(of_run, boundaries, task) for of_run in of_runs]
+        for method, of_method in by_method.items():
+            curves = [series(result, task) for result in of_method]
             curves = [(steps, smoothed(values, window)) for steps, values in curves if len(steps)]
             if not curves:
                 continue
@@ -168,6 +173,6 @@ def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
     legend = {}
     for panel in panels:
         legend.update({label: handle for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)})
-    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=len(legend), frameon=False)
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 5), frameon=False)
     figure.savefig(path, dpi=100)
     plt.close(figure)

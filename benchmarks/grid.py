@@ -143,7 +143,7 @@ def cells(
     :param n_seeds: Number of seeds, from 0; by default that of the budget
     :param budget: One of ``BUDGETS``
     :return: The cells, in the order in which they are to run
-    :raises ValueError: For an environment or a method that none of the suites has, or less than one seed
+    :raises ValueError: For an environment or a method that none of the suites has, less than one seed, or when nothing is left
     """
     _check("env", env_ids, [env_id for suite in suites for env_id in SUITES[suite].env_ids], suites)
     _check("method", methods, [name for name in METHODS if any(name in SUITES[suite].methods for suite in suites)], suites)
@@ -167,6 +167,10 @@ def cells(
                 for seed in range(seeds)
                 for rank, method in enumerate(order)
             ]
+    if not grid:
+        raise ValueError(
+            f"--method must be one that is compared in {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
+        )
     return [cell for *_, cell in sorted(grid, key=lambda entry: entry[:2])]
 
 

@@ -100,13 +100,18 @@ class GridView:
             f"{self.n_done} of {total}: {cell.name} done in {duration(seconds)}{left}", soft_wrap=True, highlight=False
         )
 
-    def fail(self, failure: Failure) -> None:
+    def fail(self, failure: Failure, again: bool) -> None:
         """
-        :param failure: Of a run that is not tried again
+        :param failure: Of a run
+        :param again: Whether it is tried again
         """
         del self.running[failure.cell]
-        self.failures.append(failure)
-        self.console.print(f"[red]{escape(str(failure))}[/red]", soft_wrap=True, highlight=False)
+        if again:
+            self.waiting.insert(0, failure.cell)
+        else:
+            self.failures.append(failure)
+        words = f"{failure}{' (tried again)' * again}"
+        self.console.print(f"[red]{escape(words)}[/red]", soft_wrap=True, highlight=False)
 
     def time_left(self) -> float:
         """

@@ -18,11 +18,12 @@ from benchmarks.estimates import METRICS, agrees, normalized, probability_of_imp
 from benchmarks.figures import NTK, plot_learning_curves, plot_ntk, plot_reliable_metrics
 from benchmarks.page import html_page
 from benchmarks.paper import AGGREGATE, Table, read_tables
-from benchmarks.results import Result, read_results
+from benchmarks.results import METHODS, Result, in_json, read_results
+from benchmarks.runs import shipped_hyperparameters
 from benchmarks.suites import SUITES
 from benchmarks.tables import (
     MISSING,
-    algo_of,
+    label_of,
     lengths_table,
     listed,
     mark_differences,
@@ -55,20 +56,26 @@ time, which the `run.json` of each run holds.
 
 - **J(T)**, what the cells hold, is the average return over the whole of learning, not that of the final policy: the mean
   return of the episodes that ended in a rollout (in MinAtar: of ten greedy episodes of an evaluation), mean over the
-  rollouts of a task, mean over the tasks (Eq. 1 of the paper). Greater is better.
+  rollouts of a task in which any ended, mean over the tasks (Eq. 1 of the paper). Greater is better. In DeepMind Control,
+  too, the episodes are those of training, where the paper evaluates every 20,000 steps.
 - **±** is the standard error of the mean over the seeds: their standard deviation (with n - 1) over √n.
 - The **95 % interval** is a percentile bootstrap of the mean over the seeds, 10,000 resamples. With three seeds or fewer it
   reaches from the lowest seed to the highest, and holds the true mean less often than its name says: of three seeds, in
   about three cases of four.
 - **✓** the cell agrees with the paper: the interval overlaps the paper's mean ± 2 standard errors. **✗** it does not.
-  Overlap is a mild test; wide intervals agree easily. A single seed has no ±, no interval and neither sign.
+  Overlap is a mild test; wide intervals agree easily. A single seed has no ±, no interval and neither sign. Between runs of
+  different lengths neither sign says much.
+- In Gym Control and ProcGen the **paper's coefficients are tuned**: of C-CHAIN's β, weight clipping's κ and L2 Init's c it
+  reports the best of 3, 4 and 5 values in each environment. Those here are the shipped ones, one of each for a whole suite,
+  and not chosen by the runs that the tables show. They stand below each suite's table.
 - **Bold** is the best mean, <ins>underlined</ins> the second, without the Oracle, and no second of two methods, as the paper
   marks; of a single method nothing is marked. Marks go by the numbers, in the paper's rows too, and among the cells that are
   there.
 - **{missing}** is missing: no finished run, or not in the paper. Nothing is filled in. *seeds* are all that finished.
 - The **aggregate** is the sum of the environments' means, as the paper's "Agg. Score"; missing unless all of them are there.
 - *PPO*, in MinAtar *Double DQN*, is what the paper calls Vanilla. *Oracle* starts anew at each task.
-- **†** the seeds of the cell were not all run with the same versions; which is said below the table."""
+- **†** the seeds of the cell were not all run with the same versions of the packages; which is said below the table. The
+  commits of this repository that the runs were made at are listed at the end."""
 
 
 NORMALIZATION = """\
@@ -76,11 +83,13 @@ Scores are J(T), normalised in each environment so that 0 is the lowest and 1 th
 methods, the Oracle among them: a scale that the runs here do not move. (From the paper's Vanilla to its Oracle is no scale:
 they lie too close together in Leaper, and the other way round in Quadruped.) The optimality gap is what is missing to 1, on
 average, scores above counting as 1: less is better. In brackets the 95 % interval, bootstrapped over seeds within each
-environment."""
+environment. An environment in which the paper's means lie close together, as in Leaper, moves the mean more than others do,
+and the IQM less."""
 
 IMPROVEMENT = """\
 The probability of improvement is that a run of C-CHAIN has a higher J(T) than one of the other method, mean over the
-environments; 0.5 says nothing either way. Beside it, in how many environments C-CHAIN's mean is the higher one."""
+environments; 0.5 says nothing either way. Beside it, in how many environments C-CHAIN's mean is the higher one, of the seeds
+of the table above."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
@@ -128,6 +137,7 @@ def _suite_section(suite: str, results: Sequence[Result], paper: Table, folder: 
     cells, left_out = cells_of(results)
     parts = [f"## {TITLES[suite]}", lengths_table(results, paper), results_table(suite, cells, paper)]
     parts += _notes(suite, cells, paper, left_out)
+    parts += _hyperparameters_section(suite, results, paper)
     if marks := mark_differences(suite, paper):
         parts.append("Where the paper's own marks or sums are not those of its numbers:\n\n" + "\n".join(marks))
     parts += _reliable_section(suite, cells, paper, folder)
@@ -147,16 +157,51 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
         f"{n_agree} agree with the paper."
     ]
     different = [
-        f"- † {name_of(env_id)}, {LABELS[algo_of(suite, method)]}: "
+        f"- † {name_of(env_id)}, {label_of(suite, method)}: "
         + "; ".join(f"seeds {listed(seeds)} with {versions}" for versions, seeds in cell.versions)
         for (env_id, method), cell in cells.items()
         if len(cell.versions) > 1
     ]
     if different:
         notes.append("\n".join(different))
+    most = max((cell.seeds for cell in cells.values()), key=len, default=[])
+    if fewer := [
+        f"- {name_of(env_id)}, {label_of(suite, method)}: {listed(cell.seeds)}"
+        for (env_id, method), cell in cells.items()
+        if len(cell.seeds) < len(most)
+    ]:
+        notes.append(
+            f"Not all of the seeds {listed(most)} finished, for want of time or because they failed, in:\n\n"
+            + "\n".join(fewer)
+        )
     if left_out:
         notes.append("Left out, as their J(T) is not defined:\n\n" + "\n".join(f"- {reason}" for reason in left_out))
     return notes
+
+
+def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:
+    """What makes a method of Vanilla, as the runs had it; and which had other hyperparameters than are shipped now."""
+    differences: dict[tuple[str, str], list[str]] = {}
+    for env_id, runs in _by_env(results, paper).items():
+        vanilla = in_json(shipped_hyperparameters(SUITES[suite].methods["vanilla"], env_id))
+        for method, hyperparameters in {run.method: run.hyperparameters for run in runs if run.method != "vanilla"}.items():
+            differing = [f"`{name}: {value}`" for name, value in hyperparameters.items() if vanilla.get(name) != value]
+            key = label_of(suite, method), ", ".join(differing) or "nothing in the settings"
+            differences.setdefault(key, []).append(name_of(env_id))
+    lines = [f"- {label} ({', '.join(names)}): {differing}" for (label, differing), names in differences.items()]
+    parts = [
+        "### Hyperparameters",
+        f"What the settings of each method have beside {label_of(suite, 'vanilla')}'s, or instead:",
+        "\n".join(lines) if lines else "Nothing else was run.",
+    ]
+    others = [
+        f"- {name_of(result.env_id)}, {label_of(suite, result.method)}, seed {result.seed}"
+        for result in results
+        if result.hyperparameters != in_json(shipped_hyperparameters(result.algo, result.env_id))
+    ]
+    if others:
+        parts += ["**Not under the hyperparameters that are shipped now:**", "\n".join(others)]
+    return parts
 
 
 def _reliable_section(suite: str, cells: Cells, paper: Table, folder: Path) -> list[str]:
@@ -165,7 +210,7 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, folder: Path) -> l
     if not {"vanilla", "cchain"} <= set(scores):
         return []
     low, high = (np.array([end(paper.means(env_id).values()) for env_id in env_ids]) for end in (min, max))
-    algos = {method: algo_of(suite, method) for method in scores}
+    algos = {method: SUITES[suite].methods[method] for method in scores}
     estimates, intervals = reliable_metrics({method: normalized(of_method, low, high) for method, of_method in scores.items()})
     several = [method for method in scores if len(seeds[method]) > 1]
 
@@ -175,7 +220,7 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, folder: Path) -> l
         if method in several:
             figures = [f"{figure} [{lo:.2f}, {hi:.2f}]" for figure, lo, hi in zip(figures, *intervals[method], strict=True)]
         rows.append([LABELS[algos[method]], listed(seeds[method]), *figures])
-    without = [LABELS[algo_of(suite, method)] for method in methods_of(cells, paper) if method not in scores]
+    without = [label_of(suite, method) for method in methods_of(cells, paper) if method not in scores]
     words = [
         f"Over {', '.join(map(name_of, env_ids))}, where Vanilla and C-CHAIN both have runs. "
         + (f"Left out, as they do not have runs in all of them: {', '.join(without)}. " if without else "")
@@ -195,12 +240,12 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, folder: Path) -> l
         *words,
         markdown_table(header, rows),
         *([f"![Metrics over the environments of {TITLES[suite]}]({picture})"] if several else []),
-        *_improvement(suite, env_ids, scores, several, cells, paper),
+        *_improvement(suite, env_ids, scores, several, paper),
     ]
 
 
 def _improvement(
-    suite: str, env_ids: Sequence[str], scores: Mapping[str, np.ndarray], several: Sequence[str], cells: Cells, paper: Table
+    suite: str, env_ids: Sequence[str], scores: Mapping[str, np.ndarray], several: Sequence[str], paper: Table
 ) -> list[str]:
     """C-CHAIN against each other method."""
     rows = []
@@ -208,12 +253,12 @@ def _improvement(
         text = f"{probability:.2f}"
         if method in several and "cchain" in several:
             text += f" [{interval[0]:.2f}, {interval[1]:.2f}]"
-        higher = sum(cells[env_id, "cchain"].mean > cells[env_id, method].mean for env_id in env_ids)
+        higher = int((scores["cchain"].mean(axis=0) > scores[method].mean(axis=0)).sum())
         of_paper = MISSING
         if method in paper.methods:
             means = [paper.means(env_id) for env_id in env_ids]
             of_paper = f"{sum(mean['cchain'] > mean[method] for mean in means)} of {len(env_ids)}"
-        rows.append([LABELS[algo_of(suite, method)], text, f"{higher} of {len(env_ids)}", of_paper])
+        rows.append([label_of(suite, method), text, f"{higher} of {len(env_ids)}", of_paper])
     header = ["C-CHAIN over", "probability of improvement", "higher mean, here", "higher mean, paper"]
     return [
         IMPROVEMENT,
@@ -266,8 +311,12 @@ def _runs_section(results: Sequence[Result], budget: str) -> str:
     counted = [f"- {n} runs with {name}" for name, n in versions.items()] + [
         f"- {n} runs at {name}" for name, n in commits.items()
     ]
-    suites = dict.fromkeys(result.suite for result in results)
-    commands = [f"python -m benchmarks.run --suite {suite} --budget {budget}" for suite in suites]
+    commands = []
+    for suite in dict.fromkeys(result.suite for result in results):
+        of_suite = [result for result in results if result.suite == suite]
+        methods = " ".join(method for method in METHODS if any(result.method == method for result in of_suite))
+        n_seeds = 1 + max(result.seed for result in of_suite)
+        commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} --method {methods} --seeds {n_seeds}")
     commands.append(f"python -m benchmarks.report --budget {budget}")
     return "\n\n".join(
         [
@@ -275,6 +324,7 @@ def _runs_section(results: Sequence[Result], budget: str) -> str:
             f"{len(results)} runs, {hours:.1f} hours of them in total. The `run.json` of each holds its command, "
             "versions and commit, too.",
             "\n".join(counted),
+            "The same command makes those that are missing:",
             "```bash\n" + "\n".join(commands) + "\n```",
         ]
     )
@@ -288,13 +338,17 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="Folder of the report, by default the budget's in the results")
     args = parser.parse_args()
 
-    results = read_results(args.results)
-    of_budget = [result for result in results if result.budget == args.budget]
-    if not of_budget:
-        budgets = ", ".join(sorted({result.budget for result in results})) or "none"
-        parser.error(f"no results of --budget {args.budget} in {args.results}; the budgets there: {budgets}")
-    folder = args.output or args.results / args.budget
-    write_report(of_budget, args.budget, folder)
+    try:
+        results = read_results(args.results)
+        of_budget = [result for result in results if result.budget == args.budget]
+        if not of_budget:
+            budgets = ", ".join(sorted({result.budget for result in results})) or "none"
+            raise ValueError(f"no results of --budget {args.budget} in {args.results}; the budgets there: {budgets}")
+        folder = args.output or args.results / args.budget
+        write_report(of_budget, args.budget, folder)
+    # Damaged results, too, or such as are not comparable
+    except ValueError as error:
+        parser.error(str(error))
     print(f"Written: {folder}/report.md, {folder}/report.html")
 
 

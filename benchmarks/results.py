@@ -15,11 +15,11 @@ import math
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
@@ -141,11 +141,15 @@ def read_result(path: Path) -> Result | None:
     """
     :param path: Folder of a result
     :return: The result, None where there is none
+    :raises ValueError: When it is damaged
     """
+    file = path / "run.json"
     try:
-        return Result(path=path, **json.loads((path / "run.json").read_text()))
+        return Result(path=path, **json.loads(file.read_text()))
     except FileNotFoundError:
         return None
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file} is not a result ({error}); delete its folder to repeat the run") from error
 
 
 def read_results(folder: Path) -> list[Result]:
@@ -170,9 +174,10 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
     fields = {name: in_json(value) for name, value in asdict(result).items() if name != "path"}
     hidden = _hidden(result.path)
     hidden.mkdir(parents=True)
-    (hidden / "run.json").write_text(json.dumps(fields, indent=1, allow_nan=False) + "\n")
+    with _on_disk(hidden / "run.json") as file:
+        file.write(json.dumps(fields, indent=1, allow_nan=False) + "\n")
     for name, columns, rows in (("returns.csv", COLUMNS, returns), ("metrics.csv", METRICS_COLUMNS, metrics)):
-        with open(hidden / name, "w", newline="") as file:
+        with _on_disk(hidden / name) as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
@@ -190,6 +195,15 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
         with suppress(FileNotFoundError):
             os.rename(result.path, replaced)
             shutil.rmtree(replaced)
+
+
+@contextmanager
+def _on_disk(path: Path) -> Iterator[TextIO]:
+    """A new file that, once it is closed, outlives a power cut: a rename alone may do so without what is in it."""
+    with open(path, "w", newline="") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _hidden(path: Path) -> Path:

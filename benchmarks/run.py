@@ -9,6 +9,7 @@ folder of each run. The same command goes on where it was interrupted.
 
 import argparse
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -19,7 +20,7 @@ from rich.console import Console
 
 from benchmarks.grid import BUDGETS, Cell, Rates, cells
 from benchmarks.grid_view import duration
-from benchmarks.results import METHODS, read_results
+from benchmarks.results import METHODS, read_result, read_results
 from benchmarks.runs import PACKAGES
 from benchmarks.scheduler import complete_grid, connect, import_ray
 from benchmarks.suites import SUITES
@@ -49,8 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results"), help="Folder of the results")
     parser.add_argument("--logs", type=Path, default=Path("logs/grid"), help="Folder of the logs, on the machine of the run")
     args = parser.parse_args(arguments)
-    if args.gpus_per_run < 0:
-        parser.error(f"--gpus-per-run must be 0 or more; got {args.gpus_per_run}")
+    # As Ray divides them
+    if not (0.0001 <= args.gpus_per_run <= 1 or (args.gpus_per_run >= 0 and args.gpus_per_run.is_integer())):
+        parser.error(f"--gpus-per-run must be from 0.0001 to 1, or a whole number; got {args.gpus_per_run}")
     if args.cpus is not None and (args.cpus < 1 or args.address):
         parser.error(f"--cpus must be at least 1, and goes without --address, whose nodes have their own; got {args.cpus}")
 
@@ -64,10 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             console.print(f"All {len(grid)} runs are done. Results: {args.results}")
             note_versions(grid, args.results, console)
             return 0
+        note_replaced(grid, args.results, console)
         ray = import_ray()
+        check_writable(args.results)
         connect(ray, args.address, args.cpus, args.gpus_per_run)
-    # An extra that is not installed, or a cluster that is not there, too
-    except (ValueError, ImportError, ConnectionError, gym.error.Error) as error:
+    # An extra that is not installed, a folder or a cluster that is not there, too
+    except (ValueError, ImportError, OSError, gym.error.Error) as error:
         parser.error(str(error))
     try:
         failures = complete_grid(ray, grid, args.results, args.logs, args.gpus_per_run, console)
@@ -106,7 +110,34 @@ def list_grid(grid: Sequence[Cell], results: Path, console: Console) -> None:
         soft_wrap=True,
         highlight=False,
     )
+    note_replaced(grid, results, console)
     note_versions(grid, results, console)
+
+
+def check_writable(folder: Path) -> None:
+    """
+    :param folder: Folder of all results, which is made where it is missing
+    :raises ValueError: When nothing can be written there, which a run should not come to its end to find out
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ValueError(f"--results must be a folder that can be written to; got {folder}: {error}") from error
+
+
+def note_replaced(grid: Sequence[Cell], results: Path, console: Console) -> None:
+    """
+    Say which results are of other hyperparameters or lengths than the runs that will take their place.
+
+    :param grid: Cells
+    :param results: Folder of all results
+    :param console: Where to
+    """
+    for cell in grid:
+        if cell.result(results) is None and (other := read_result(cell.path(results))) is not None:
+            names = ", ".join(name for name, value in cell.settings.items() if other.settings[name] != value)
+            console.print(f"{other.path} is of other {names}, and will be replaced.", soft_wrap=True, highlight=False)
 
 
 def note_versions(grid: Sequence[Cell], results: Path, console: Console) -> None:

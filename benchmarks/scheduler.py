@@ -7,6 +7,7 @@ import socket
 import subprocess
 import time
 import uuid
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -22,7 +23,8 @@ from benchmarks.results import METRICS, Result, in_json, read_results, write_res
 from benchmarks.runs import PACKAGES, peak_memory, shipped_hyperparameters
 from benchmarks.suites import SUITES
 
-# How often a run that dies, with its machine or by itself, is begun again
+# How often a run that dies, with its machine or by itself, is begun again. Not by Ray, whose retries nobody sees, and which
+# are without end where memory ran out
 RETRIES = 2
 
 ROOT = Path(__file__).parent.parent
@@ -136,7 +138,7 @@ def import_ray() -> Any:
     try:
         import ray
     except ImportError as error:
-        raise ImportError(f'The grid needs Ray ({error}): pip install "sb3-cchain[cluster]"') from error
+        raise ImportError(f'The grid needs Ray ({error}): pip install -e ".[cluster]"') from error
     return ray
 
 
@@ -200,11 +202,10 @@ def complete_grid(
     """
     waiting = [cell for cell in cells if cell.result(results) is None]
     view = GridView(waiting, len(cells) - len(waiting), Rates(read_results(results)), console or Console())
-    task = ray.remote(train).options(
-        num_cpus=1, num_gpus=gpus_per_run, max_retries=RETRIES, retry_exceptions=True, scheduling_strategy="SPREAD"
-    )
+    task = ray.remote(train).options(num_cpus=1, num_gpus=gpus_per_run, max_retries=0, scheduling_strategy="SPREAD")
     arguments = (logs.absolute(), "cuda" if gpus_per_run > 0 else "cpu", commit_of_checkout())
     running: dict[Any, Cell] = {}
+    n_failures: Counter[Cell] = Counter()
     with view.live:
         while view.waiting or running:
             # No more than can run, so that what another process has done meanwhile is seen
@@ -222,7 +223,8 @@ def complete_grid(
                 try:
                     finished = Finished(*ray.get(reference))
                 except ray.exceptions.RayError as error:
-                    view.fail(_failure(cell, error, logs))
+                    n_failures[cell] += 1
+                    view.fail(_failure(cell, error, logs), again=n_failures[cell] <= RETRIES)
                 else:
                     result = replace(finished.result, path=cell.path(results))
                     write_result(result, finished.returns, finished.metrics)
@@ -235,5 +237,4 @@ def _failure(cell: Cell, error: Exception, logs: Path) -> Failure:
     cause = getattr(error, "cause", None) or error
     if isinstance(cause, RunFailed):
         return Failure(cell, *cause.args)
-    lines = str(cause).strip().splitlines() or [""]
-    return Failure(cell, f"{type(cause).__name__}: {lines[0]}", str(cell.path(logs)))
+    return Failure(cell, f"{type(cause).__name__}: {' '.join(str(cause).split())}"[:200], str(cell.path(logs)))

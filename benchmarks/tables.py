@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.cells import Cell, Cells
 from benchmarks.curves import LABELS
 from benchmarks.estimates import agrees, best_two
-from benchmarks.figures import NTK, of_task
+from benchmarks.figures import NTK, metric_of_task
 from benchmarks.paper import AGGREGATE, Table
 from benchmarks.results import METHODS, Result
 from benchmarks.suites import SUITES
@@ -25,16 +25,13 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows])
 
 
-def algo_of(suite: str, method: str) -> str:
+def label_of(suite: str, method: str) -> str:
     """
     :param suite: Name of a suite
     :param method: Name of a method
-    :return: Its name on the command line in that suite
+    :return: What it is called there
     """
-    vanilla, cchain = SUITES[suite].algos
-    if method in ("vanilla", "cchain"):
-        return vanilla if method == "vanilla" else cchain
-    return next(algo for algo in SUITES[suite].others if algo.endswith(f"_{method}"))
+    return LABELS[SUITES[suite].methods[method]]
 
 
 def methods_of(cells: Cells, paper: Table) -> list[str]:
@@ -104,7 +101,7 @@ def results_table(suite: str, cells: Cells, paper: Table) -> str:
             ["aggregate", "here", *_sums(aggregates(cells, methods, paper), methods, digits)],
             ["", "paper", *_sums(printed_sums, methods, digits)],
         ]
-    return markdown_table(["J(T)", "", *(LABELS[algo_of(suite, method)] for method in methods)], rows)
+    return markdown_table(["J(T)", "", *(label_of(suite, method) for method in methods)], rows)
 
 
 def aggregates(cells: Cells, methods: Sequence[str], paper: Table) -> dict[str, float]:
@@ -127,7 +124,7 @@ def mark_differences(suite: str, paper: Table) -> list[str]:
     differences = []
     for (env_id, method), figure in paper.figures.items():
         means = paper.means(env_id)
-        name, label = "Aggregate" if env_id == AGGREGATE else name_of(env_id), LABELS[algo_of(suite, method)]
+        name, label = "Aggregate" if env_id == AGGREGATE else name_of(env_id), label_of(suite, method)
         if best_two(means).get(method, "") != figure.mark:
             rank = 1 + sum(mean > figure.mean for other, mean in means.items() if other != "oracle")
             marked = f"marked as {figure.mark}" if figure.mark else "not marked"
@@ -174,8 +171,7 @@ def ntk_table(results: Sequence[Result]) -> str:
             runs = [result for result in results if result.method == method]
             per_seed = []
             for result in runs:
-                series = np.array(result.metrics().get(quantity.name, [])).reshape(-1, 2).T
-                in_tasks = [of_task((series[0], series[1]), result.task_boundaries, i)[1] for i in range(result.n_tasks)]
+                in_tasks = [metric_of_task(result, quantity.name, task)[1] for task in range(result.n_tasks)]
                 per_seed.append([values.mean() if len(values) else math.nan for values in in_tasks])
             if runs:
                 means = [MISSING if math.isnan(mean) else f"{mean:.3g}" for mean in np.mean(per_seed, axis=0)]

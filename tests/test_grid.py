@@ -184,10 +184,14 @@ def test_a_cell_is_the_command_that_a_user_would_type(tmp_path):
         (["--env", "Continual/Maze-v0"], "--env must be of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0"),
         (["--method", "redo"], "--method must be of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
         (["--seeds", "0"], "--seeds must be at least 1; got 0"),
-        (["--gpus-per-run", "-1"], "--gpus-per-run must be 0 or more; got -1"),
+        (["--gpus-per-run", "-1"], "--gpus-per-run must be from 0.0001 to 1, or a whole number; got -1"),
+        (["--gpus-per-run", "1.5"], "--gpus-per-run must be .*; got 1.5"),
+        (["--gpus-per-run", "1e-5"], "--gpus-per-run must be .*; got 1e-05"),
+        (["--gpus-per-run", "nan"], "--gpus-per-run must be .*; got nan"),
+        (["--results", __file__], "Not a directory: .*test_grid.py"),
         (["--cpus", "0"], "--cpus must be at least 1"),
         (["--cpus", "2", "--address", "auto"], "goes without --address"),
-        ([], r'The grid needs Ray .*: pip install "sb3-cchain\[cluster\]"'),
+        ([], r'The grid needs Ray .*: pip install -e ".\[cluster\]"'),
     ],
 )
 def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monkeypatch):
@@ -197,6 +201,37 @@ def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monke
         main(["--suite", "gym_control", *folders, *arguments])
     assert error.value.code == 2 and re.search(message, capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_grid_is_an_error(capsys):
+    with pytest.raises(SystemExit):
+        main(["--suite", "all", "--method", "redo", "--env", "Continual/Acrobot-v1"])
+    assert "--method must be one that is compared in Continual/Acrobot-v1; got redo" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("benchmarks.run.import_ray", lambda: None)
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError("Read-only file system")))
+    with pytest.raises(SystemExit):
+        main(["--suite", "gym_control", "--results", str(tmp_path / "new")])
+    expected = f"--results must be a folder that can be written to; got {tmp_path / 'new'}: Read-only file system"
+    assert expected in capsys.readouterr().err
+
+
+def test_a_damaged_result_is_named(tmp_path, capsys):
+    CELL.path(tmp_path).mkdir(parents=True)
+    for text in ("", "{}"):
+        (CELL.path(tmp_path) / "run.json").write_text(text)
+        with pytest.raises(SystemExit):
+            main(["--suite", "gym_control", "--budget", "smoke", "--dry-run", "--results", str(tmp_path)])
+        assert f"{CELL.path(tmp_path) / 'run.json'} is not a result" in capsys.readouterr().err
+
+
+def test_results_that_will_be_replaced_are_told(tmp_path, capsys):
+    result = make_result(tmp_path, hyperparameters={}, seed=0)
+    write_result(result, ROWS, [])
+    assert main(["--suite", "gym_control", "--budget", "smoke", "--dry-run", "--results", str(tmp_path)]) == 0
+    assert f"{result.path} is of other hyperparameters, and will be replaced." in capsys.readouterr().out
 
 
 def test_dry_run(tmp_path, capsys, monkeypatch):
@@ -256,7 +291,10 @@ def test_time_left_by_hand(monkeypatch):
     view.finish(some[0], 30.0)
     # They take one and a half times as long as was believed: nothing is left of the second
     assert view.time_left() == pytest.approx((0 + 3 * 30) / 2)
-    view.fail(Failure(some[1], "ValueError: [no]", "/logs/log.txt", "elsewhere"))
+    view.fail(Failure(some[1], "ValueError: [no]", "/logs/log.txt", "elsewhere"), again=True)
+    assert view.waiting[0] == some[1]
+    view.start(some[1])
+    view.fail(Failure(some[1], "ValueError: [no]", "/logs/log.txt", "elsewhere"), again=False)
     view.start(some[2])
     view.skip(some[3])
     assert view.time_left() == pytest.approx(30.0)
@@ -264,9 +302,10 @@ def test_time_left_by_hand(monkeypatch):
     shown = console.export_text().splitlines()
     assert shown[0] == "4 of 8: CartPole-v1 cchain seed 0 done in 30 s, 45 s left"
     failure = "CartPole-v1 cchain seed 1 failed: ValueError: [no]; see elsewhere:/logs/log.txt"
-    assert shown[1].strip() == failure and shown[-1].strip() == failure
-    assert shown[2].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
-    assert shown[3].split() == "CartPole-v1 cchain seed 2 0 s".split()
+    assert shown[1].strip() == f"{failure} (tried again)"
+    assert shown[2].strip() == failure and shown[-1].strip() == failure
+    assert shown[3].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
+    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s".split()
 
 
 def test_an_address_at_which_nothing_answers():
@@ -334,6 +373,69 @@ def test_a_failed_run_says_why(tmp_path):
     reason, log, _ = error.value.args
     assert "\n" not in reason and "Acrobot-v1" in reason
     assert Path(log).is_relative_to(bad.path(tmp_path)) and reason in Path(log).read_text()
+
+
+class FakeRay:
+    """
+    Runs a task as soon as it is waited for.
+
+    :param outcomes: What becomes of the tasks of a seed, one after the other: a result, or an error
+    """
+
+    class exceptions:
+        class RayError(Exception):
+            pass
+
+    def __init__(self, outcomes):
+        self.outcomes, self.calls = outcomes, []
+
+    def cluster_resources(self):
+        return {"CPU": 2.0, "GPU": 1.0}
+
+    def remote(self, function):
+        return self
+
+    def options(self, **options):
+        assert options == dict(num_cpus=1, num_gpus=0.25, max_retries=0, scheduling_strategy="SPREAD")
+        remote = lambda *arguments: self.calls.append(arguments) or len(self.calls) - 1  # noqa: E731
+        return type("Task", (), {"remote": staticmethod(remote)})
+
+    def wait(self, references, num_returns, timeout):
+        return references[:1], references[1:]
+
+    def get(self, reference):
+        outcome = self.outcomes[self.calls[reference][0].seed].pop(0)()
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+
+def test_which_runs_are_begun(tmp_path):
+    """
+    Of four seeds, the first comes to its end at the third attempt, the second never; another process finishes the third, which
+    waits meanwhile; the fourth was done before.
+    """
+    grid = [replace(CELL, seed=seed) for seed in range(4)]
+    made = [make_result(tmp_path, cell) for cell in grid]
+    write_result(made[3], ROWS, [])
+
+    def error():
+        return FakeRay.exceptions.RayError("line 1\n\nline 2")
+
+    def finish():
+        write_result(made[2], ROWS, [])
+        return made[0], ROWS, []
+
+    ray = FakeRay({0: [error, error, finish], 1: [error] * 3})
+    output = Console(record=True, file=open(os.devnull, "w"), width=300)
+    failures = complete_grid(ray, grid, tmp_path, tmp_path / "logs", 0.25, output)
+    assert read_results(tmp_path) == [made[0], made[2], made[3]]
+    assert [(failure.cell.seed, failure.reason) for failure in failures] == [(1, "RayError: line 1 line 2")]
+    assert sorted(arguments[0].seed for arguments in ray.calls) == [0, 0, 0, 1, 1, 1]
+    assert {arguments[2] for arguments in ray.calls} == {"cuda"}
+    shown = output.export_text()
+    assert shown.count("seed 0 failed: RayError: line 1 line 2; see") == shown.count("seed 0 failed") == 2
+    assert shown.count("seed 1 failed") == 3 and shown.count("(tried again)") == 4
 
 
 # --- With Ray -----------------------------------------------------------------------------------------------------------

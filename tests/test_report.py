@@ -16,13 +16,14 @@ from benchmarks.estimates import (
     probability_of_improvement,
     reliable_metrics,
 )
-from benchmarks.figures import band, of_task
+from benchmarks.figures import band, metric_of_task, plot_learning_curves, returns_of_task
 from benchmarks.page import html_page
 from benchmarks.paper import read_tables
 from benchmarks.report import main, write_report
-from benchmarks.results import Result, read_results, result_path, write_result
+from benchmarks.results import METHODS, Result, in_json, read_results, result_path, write_result
+from benchmarks.runs import shipped_hyperparameters
 from benchmarks.suites import ALL_ENVS, SUITES
-from benchmarks.tables import aggregates, algo_of, mark_differences, ntk_table, results_table, score_matrices
+from benchmarks.tables import aggregates, mark_differences, ntk_table, results_table, score_matrices
 
 ACROBOT, CARTPOLE = "Continual/Acrobot-v1", "Continual/CartPole-v1"
 VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
@@ -33,23 +34,23 @@ def few_resamples(monkeypatch):
     monkeypatch.setattr("benchmarks.estimates.N_RESAMPLES", 100)
 
 
-def write(folder, method, returns, env_id=ACROBOT, seed=0, metrics=(), **fields):
+def write(folder, method, returns, env_id=ACROBOT, seed=0, metrics=(), suite="gym_control", **fields):
     """A run of two tasks of 100 steps, with one rollout for each of the returns of a task."""
     of_tasks = dict(enumerate(returns))
     result = Result(
         **{
-            "path": result_path(folder, "smoke", "gym_control", env_id, method, seed),
-            "suite": "gym_control",
+            "path": result_path(folder, "smoke", suite, env_id, method, seed),
+            "suite": suite,
             "env_id": env_id,
             "method": method,
-            "algo": algo_of("gym_control", method),
+            "algo": SUITES[suite].methods[method],
             "seed": seed,
             "budget": "smoke",
             "n_tasks": 2,
             "steps_per_task": 100,
             "task_names": ["task 0", "task 1"],
             "task_boundaries": [100, 200],
-            "hyperparameters": {"learning_rate": 1e-3},
+            "hyperparameters": in_json(shipped_hyperparameters(SUITES[suite].methods[method], env_id)),
             "command": ["sb3-cchain", "train"],
             "versions": VERSIONS,
             "git_commit": None,
@@ -321,9 +322,42 @@ def test_band_by_hand():
     assert (low == mean).all() and (high == mean).all()
 
 
-def test_the_step_that_ends_a_task_is_of_that_task():
-    steps, values = of_task((np.array([50, 100, 101, 200]), np.arange(4.0)), [100, 200], 0)
-    assert steps.tolist() == [50, 100] and values.tolist() == [0.0, 1.0]
+def test_which_task_a_metric_is_of(tmp_path):
+    """The step that ends a task is of that task, and the last rollout goes beyond the end of the last."""
+    metrics = [(steps, "ntk/srank", value) for value, steps in enumerate((50, 100, 101, 200, 210))]
+    write(tmp_path, "cchain", [[0], [0]], metrics=metrics)
+    (result,) = read_results(tmp_path)
+    series = [[part.tolist() for part in metric_of_task(result, "ntk/srank", task)] for task in (0, 1)]
+    assert series == [[[50, 100], [0.0, 1.0]], [[101, 200, 210], [2.0, 3.0, 4.0]]]
+    assert metric_of_task(result, "ntk/diagonal_sum", 0)[0].size == 0
+
+
+def test_a_rollout_over_a_switch_counts_in_both_tasks(tmp_path):
+    """Its rows have the same environment step, that of its end, behind the switch."""
+    write(tmp_path, "cchain", [[0], [0]])
+    (result,) = read_results(tmp_path)
+    rows = "timesteps,task_id,n_episodes,mean_return\n60,0,1,900\n120,0,1,910\n120,1,2,100\n240,1,1,110\n"
+    (result.path / "returns.csv").write_text(rows)
+    series = [[part.tolist() for part in returns_of_task(result, task)] for task in (0, 1)]
+    assert series == [[[60, 120], [900.0, 910.0]], [[120, 240], [100.0, 110.0]]]
+
+
+def test_the_legend_of_all_methods_fits(tmp_path, monkeypatch):
+    """Those of ProcGen, the most that there are."""
+    import matplotlib.pyplot as plt
+
+    for method in METHODS:
+        write(tmp_path, method, [[0, 1], [0, 1]], suite="procgen", hyperparameters={})
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    plot_learning_curves(read_results(tmp_path), tmp_path / "picture.png", 1, own_scales=False)
+    monkeypatch.undo()
+    (figure,) = figures
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == len(METHODS) == 9
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 and box.x1 <= figure.bbox.width
+    plt.close(figure)
 
 
 def test_page_needs_nothing_beside_it(tmp_path):
@@ -397,6 +431,56 @@ def test_versions_that_differ_are_told(tmp_path):
     write_report(read_results(tmp_path), "smoke", tmp_path / "out")
     told = "- † Acrobot-v1, TRAC: seeds 0 with torch 2.8.0; seeds 1 with torch 2.9.0"
     assert told in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_hyperparameters_are_told(tmp_path):
+    make_results(tmp_path)
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    (line,) = [line for line in text.splitlines() if line.startswith("- C-CHAIN PPO (Acrobot-v1, CartPole-v1): ")]
+    assert "`churn_coef: auto_1`, `target_churn_ratio: 10000.0`" in line and "learning_rate" not in line
+    assert "shipped now" not in text
+    write(tmp_path, "trac", [[0], [0]], hyperparameters={"learning_rate": 1.0})
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "- TRAC (Acrobot-v1): `learning_rate: 1.0`" in text
+    assert "that are shipped now:**\n\n- Acrobot-v1, TRAC, seed 0\n\n" in text
+
+
+def test_seeds_that_lack_are_told(tmp_path):
+    make_results(tmp_path)
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert (
+        "Not all of the seeds 0 1 finished, for want of time or because they failed, in:\n\n- Acrobot-v1, Oracle: 0\n\n"
+        in text
+    )
+
+
+def test_the_count_of_higher_means_is_of_the_seeds_that_are_compared(tmp_path):
+    """Of C-CHAIN seed 0, which is in both environments: 1 < 2 in the first, where seed 1 would turn it round."""
+    write(tmp_path, "cchain", [[1], [1]])
+    write(tmp_path, "cchain", [[9], [9]], seed=1)
+    write(tmp_path, "vanilla", [[2], [2]])
+    for method, value in (("cchain", 5), ("vanilla", 4)):
+        write(tmp_path, method, [[value], [value]], env_id=CARTPOLE)
+    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    assert "| PPO | 0.50 | 1 of 2 | 2 of 2 |" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_runs_that_cannot_be_compared(tmp_path, monkeypatch, capsys):
+    make_results(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path), "--budget", "smoke"])
+    write(tmp_path, "trac", [[0], [0]])
+    write(tmp_path, "trac", [[0], [0]], seed=1, hyperparameters={})
+    with pytest.raises(SystemExit):
+        main()
+    assert "Runs of one table must not differ in `hyperparameters`" in capsys.readouterr().err
+    file = next(tmp_path.rglob("run.json"))
+    file.write_text("")
+    with pytest.raises(SystemExit):
+        main()
+    assert f"{file} is not a result" in capsys.readouterr().err
 
 
 def test_a_budget_that_is_not_there(tmp_path, monkeypatch, capsys):
