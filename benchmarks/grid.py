@@ -18,12 +18,17 @@ PAPER_SEEDS = {"dmc": 12, "minatar": 12}
 # Of two tasks, in a rollout each (both in one in ProcGen), or with an evaluation each
 SMOKE_STEPS = {"gym_control": 800, "procgen": 500, "dmc": 2048, "minatar": 200}
 
-# Environment steps per second of Vanilla and of C-CHAIN, on one core: what is believed as long as there are no results.
-# gym_control: Acrobot on a quiet machine of two cores, and 1.17 times as long for C-CHAIN (docs/results/speed.md).
+# Environment steps per second on one core (of methods that are not there, Vanilla's): what is believed without results.
+# gym_control: Acrobot on a quiet machine of two cores, and by the ratios of docs/results/speed.md.
 # procgen: Starpilot on a quiet machine (docs/results/procgen.md).
 # dmc: Walker, C-CHAIN's rate beside other programs, a lower bound (docs/results/dm_control.md).
-# minatar: the runs of docs/results/minatar.md beside other programs, lower bounds, too.
-MEASURED_RATES = {"gym_control": (500, 430), "procgen": (55, 27), "dmc": (180, 180), "minatar": (125, 82)}
+# minatar: 3 x 100 000 steps (docs/results/minatar.md) beside other programs, lower bounds, too.
+MEASURED_RATES = {
+    "gym_control": {"vanilla": 500, "cchain": 430, "trac": 410, "l2_init": 450},
+    "procgen": {"vanilla": 55, "cchain": 27},
+    "dmc": {"vanilla": 180},
+    "minatar": {"vanilla": 125, "cchain": 82},
+}
 
 
 @dataclass(frozen=True)
@@ -212,4 +217,5 @@ class Rates:
             if key in self._totals:
                 steps, seconds = self._totals[key]
                 return cell.total_steps * seconds / steps
-        return cell.total_steps / MEASURED_RATES[cell.suite][cell.method == "cchain"]
+        rates = MEASURED_RATES[cell.suite]
+        return cell.total_steps / rates.get(cell.method, rates["vanilla"])

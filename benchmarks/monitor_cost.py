@@ -3,9 +3,11 @@ What the callbacks cost that look at training, each with its defaults: the proce
 the rest of the same training. Two trainings, with and without, differ by more than that on a machine that does other things.
 
     python -m benchmarks.monitor_cost
+    python -m benchmarks.monitor_cost --impala   # one NTK of the IMPALA network, of 100 minibatches of 64 x 256 steps
 """
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
 from functools import wraps
@@ -17,10 +19,13 @@ from rich.table import Table
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv
 
 from benchmarks.speed import settings_of
 from sb3_cchain import ChurnMonitor
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
+from sb3_cchain.common.policies import ImpalaPolicy
 
 MONITORS: list[type[BaseCallback]] = [ChurnMonitor, NTKCallback, NetworkHealth]
 
@@ -28,13 +33,13 @@ MONITORS: list[type[BaseCallback]] = [ChurnMonitor, NTKCallback, NetworkHealth]
 ENTRANCES = ("_on_rollout_start", "_on_rollout_end", "_on_step", "_before_update", "_before_step")
 
 
-def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: BaseCallback, n_steps: int) -> float:
+def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: BaseCallback, n_steps: int) -> tuple[float, float]:
     """
     :param algorithm: Algorithm
     :param settings: Its arguments
     :param monitor: The callback
     :param n_steps: Environment steps to train for
-    :return: Seconds in the callback by seconds in the rest of the training
+    :return: Seconds of processor time in the callback, and in the rest of the training
     """
     inside = 0.0
 
@@ -55,13 +60,29 @@ def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: Base
     model = algorithm(**settings)
     start = time.process_time()
     model.learn(n_steps, callback=monitor)
-    return inside / (time.process_time() - start - inside)
+    return inside, time.process_time() - start - inside
+
+
+def impala() -> str:
+    """
+    :return: What one NTK of the IMPALA network costs, in words. A rollout of images in ProcGen's shape, whatever is on them
+    """
+    env = make_vec_env(FakeImageEnv, 64, seed=0, env_kwargs=dict(screen_height=64, screen_width=64, n_channels=3))
+    settings = dict(policy=ImpalaPolicy, env=env, n_steps=256, batch_size=1024, n_epochs=1, seed=0, device="cpu")
+    seconds, _ = cost(PPO, settings, NTKCallback(), 64 * 256)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    return f"The NTK of the IMPALA network: {seconds:.0f} s of processor time; the process needed {memory:.1f} GB at most."
 
 
 def main() -> None:
     """Parse the command line, measure, print."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--impala", action="store_true", help="Of the IMPALA network, once")
+    args = parser.parse_args()
     th.set_num_threads(1)
+    if args.impala:
+        Console().print(impala())
+        return
     minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
     cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
     # Ten iterations of PPO; as many updates of DQN as are between two looks
@@ -73,7 +94,8 @@ def main() -> None:
     }
     table = Table("", *(monitor.__name__ for monitor in MONITORS), title="Processor time beside that of the rest of training")
     for name, (algorithm, settings, n_steps) in trainings.items():
-        table.add_row(name, *(f"{cost(algorithm, settings, monitor(), n_steps):.1%}" for monitor in MONITORS))
+        costs = [cost(algorithm, settings, monitor(), n_steps) for monitor in MONITORS]
+        table.add_row(name, *(f"{inside / rest:.1%}" for inside, rest in costs))
     Console().print(table)
 
 

@@ -137,9 +137,9 @@ def _suite_section(suite: str, results: Sequence[Result], paper: Table, folder: 
     cells, left_out = cells_of(results)
     parts = [f"## {TITLES[suite]}", lengths_table(results, paper), results_table(suite, cells, paper)]
     parts += _notes(suite, cells, paper, left_out)
-    parts += _hyperparameters_section(suite, results, paper)
     if marks := mark_differences(suite, paper):
         parts.append("Where the paper's own marks or sums are not those of its numbers:\n\n" + "\n".join(marks))
+    parts += _hyperparameters_section(suite, results, paper)
     parts += _reliable_section(suite, cells, paper, folder)
     parts += _curves_section(suite, results, paper, folder)
     parts += _ntk_section(suite, results, paper, folder)

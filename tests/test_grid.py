@@ -259,7 +259,7 @@ def test_rates_by_hand(tmp_path):
     paper = replace(CELL, budget="paper", n_tasks=1, steps_per_task=1000)
     # Nothing known: 430 steps per second, 500 of Vanilla
     assert Rates([]).seconds(paper) == pytest.approx(1000 / 430)
-    assert Rates([]).seconds(replace(paper, method="trac")) == pytest.approx(2.0)
+    assert Rates([]).seconds(replace(paper, method="weight_clipping")) == pytest.approx(2.0)
     results = [make_result(tmp_path, CELL, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
     results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
     # Of the suite, 3200 steps in 64 seconds, not of smoke runs, though of the same environment
