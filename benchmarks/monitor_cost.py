@@ -81,7 +81,7 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     if args.impala:
-        Console().print(impala())
+        print(impala())
         return
     minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
     cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
