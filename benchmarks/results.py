@@ -4,7 +4,7 @@ Finished runs, one small folder each, readable without this package:
 
 - ``run.json``: what was run (:class:`Result` names the fields)
 - ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, each evaluation
-- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRICS``; the header alone
+- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRIC_PREFIXES``; the header alone
   where none was logged
 """
 
@@ -26,7 +26,7 @@ from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 
 # Of a suite, those that the paper compares in it
 METHODS = ("oracle", "vanilla", "trac", "weight_clipping", "l2_init", "layer_norm", "redo", "adam_rel", "cchain")
-METRICS = ("churn/", "churn_monitor/", "ntk/", "health/")
+METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/")
 METRICS_COLUMNS = ("timesteps", "name", "value")
 
 # Of a result's fields, those that determine the run. Not the versions, which are recorded: a result of another version is one

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from benchmarks.grid import Cell, Rates
 from benchmarks.grid_view import Failure, GridView
-from benchmarks.results import METRICS, Result, in_json, read_results, write_result
+from benchmarks.results import METRIC_PREFIXES, Result, in_json, read_results, write_result
 from benchmarks.runs import PACKAGES, peak_memory, shipped_hyperparameters
 from benchmarks.suites import SUITES
 
@@ -107,7 +107,7 @@ def train(cell: Cell, logs: Path, device: str = "cpu", git_commit: str | None = 
         steps_per_second=round(cell.total_steps / seconds, 1),
         peak_memory=memory,
     )
-    return Finished(result, SUITES[cell.suite].returns(run), run.scalars(METRICS))
+    return Finished(result, SUITES[cell.suite].returns(run), run.scalars(METRIC_PREFIXES))
 
 
 def _reason(log: Path, returncode: int) -> str:
