@@ -4,8 +4,8 @@ Finished runs, one small folder each, readable without this package:
 
 - ``run.json``: what was run (:class:`Result` names the fields)
 - ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, each evaluation
-- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRIC_PREFIXES``; the header alone
-  where none was logged
+- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRIC_PREFIXES``; the
+  header alone where none was logged
 """
 
 import csv
