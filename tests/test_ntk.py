@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO
@@ -64,6 +65,33 @@ def test_gradients_by_hand(vectorize):
     assert network.factor.grad is None
 
 
+class Shared(nn.Module):
+    """One module under two names, and its weight in a third module, too."""
+
+    def __init__(self):
+        super().__init__()
+        self.one = self.two = nn.Linear(3, 2)
+        self.three = nn.Linear(2, 3)
+        self.back = nn.Linear(3, 2)
+        self.back.weight = self.one.weight
+
+    def forward(self, x):
+        return self.back(self.three(self.one(x).tanh() + self.two(x)))
+
+
+def test_modules_and_parameters_of_several_names():
+    """As SB3 names a shared features extractor three times. They stay what they are, and get all of their gradient."""
+    network, minibatches = Shared(), th.randn(4, 5, 3)
+    before = list(network.parameters())
+    together = minibatch_gradients(network, lambda x: network(x).square().mean(), minibatches)
+    assert all(one is other for one, other in zip(before, network.parameters(), strict=True))
+    assert all(isinstance(module.weight, nn.Parameter) for module in (network.one, network.three, network.back))
+    for index, minibatch in enumerate(minibatches):
+        expected = th.autograd.grad(network(minibatch).square().mean(), before)
+        for gradients, one in zip(together, expected, strict=True):
+            th.testing.assert_close(gradients[index], one)
+
+
 def test_one_by_one_where_the_objective_cannot_be_vectorised():
     network, calls = Scale(), []
 
@@ -105,6 +133,8 @@ ENVS = {
     "box": "Pendulum-v1",
     "image": lambda: RandomEnv(IMAGES),
     "dict": lambda: RandomEnv(spaces.Dict({"a": spaces.Box(-1, 1, (3,)), "b": spaces.Discrete(4)})),
+    "multi-discrete": lambda: RandomEnv(action_space=spaces.MultiDiscrete([2, 3])),
+    "multi-binary": lambda: RandomEnv(action_space=spaces.MultiBinary(3)),
 }
 
 
@@ -112,9 +142,8 @@ def make_ppo(env, algorithm=PPO, **kwargs):
     env = ENVS[env]
     if callable(env):
         env = env()
-    policy = "MlpPolicy"
-    if not isinstance(env, str):
-        policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "CnnPolicy"
+    space = None if isinstance(env, str) else env.observation_space
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "CnnPolicy" if space is IMAGES else "MlpPolicy"
     return algorithm(policy, env, n_steps=24, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu", **kwargs)
 
 
@@ -136,7 +165,7 @@ def test_policy_ntk_is_that_of_the_clipped_surrogate(env, algorithm, monkeypatch
             observations = {key: th.as_tensor(array[indices, 0]) for key, array in buffer.observations.items()}
         else:
             observations = th.as_tensor(buffer.observations[indices, 0])
-        actions = th.as_tensor(buffer.actions[indices, 0])
+        actions = th.as_tensor(buffer.actions[indices, 0]).float()
         if isinstance(model.action_space, spaces.Discrete):
             actions = actions.long().flatten()
         advantages, old = th.as_tensor(normalized[indices, 0]), th.as_tensor(buffer.log_probs[indices, 0])
@@ -229,6 +258,40 @@ def test_callback_logs_and_leaves_training_as_it_is(algorithm, tmp_path):
     model.save(tmp_path / "model")
 
 
+class Encoder(BaseFeaturesExtractor):
+    """With weights, and nothing that ``vmap`` does not know."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, features_dim=5)
+        self.layer = nn.Linear(4, 5)
+
+    def forward(self, observations):
+        return self.layer(observations).tanh()
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_a_shared_features_extractor_goes_on_learning(algorithm):
+    settings = dict(n_steps=32, policy_kwargs=dict(features_extractor_class=Encoder, net_arch=[8]), seed=0, device="cpu")
+    plain = algorithm("MlpPolicy", "CartPole-v1", **settings)
+    before = plain.policy.features_extractor.layer.weight.detach().clone()
+    plain.learn(96)
+    watched = algorithm("MlpPolicy", "CartPole-v1", **settings).learn(96, callback=NTKCallback(n_minibatches=4))
+    assert not th.equal(before, plain.policy.features_extractor.layer.weight)
+    for name, parameter in plain.policy.named_parameters():
+        assert th.equal(parameter, watched.policy.get_parameter(name)), name
+
+
+def test_the_interval_goes_on_when_learn_is_called_in_pieces(tmp_path):
+    model, callback = make_ppo("discrete"), NTKCallback(n_minibatches=4, interval=3, picture_interval=2, path=tmp_path)
+    matrices = []
+    for _ in range(7):
+        model.learn(24, callback=callback, reset_num_timesteps=False)
+        matrices.append(callback.matrix)
+    # As `learn(7 * 24)`: the first, and multiples of the interval
+    assert [i + 1 for i, matrix in enumerate(matrices) if i == 0 or matrix is not matrices[i - 1]] == [1, 3, 6]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ntk_144.png", "ntk_24.png"]
+
+
 def test_no_files_without_a_folder_of_logs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_ppo("discrete").learn(24, callback=NTKCallback(n_minibatches=4))
@@ -244,7 +307,7 @@ def test_bad_arguments(argument, value):
 
 
 def test_unknown_algorithms():
-    with pytest.raises(TypeError, match="on-policy algorithms and DQN, got SAC"):
+    with pytest.raises(TypeError, match="on-policy algorithms, DQN and QRDQN, got SAC"):
         SAC("MlpPolicy", "Pendulum-v1", device="cpu").learn(10, callback=NTKCallback())
 
 

@@ -31,7 +31,7 @@ def minibatch_gradients(network: nn.Module, objective: Objective, minibatches: A
     reached = [name for name, gradient in zip(trained, first, strict=True) if gradient is not None]
     if vectorize:
         try:
-            return _together(network, objective, minibatches, {name: trained[name].detach() for name in reached})
+            return _together(network, objective, minibatches, {name: trained[name] for name in reached})
         except RuntimeError:
             pass  # what is wrong with the objective itself is raised below
     return _one_by_one(objective, minibatches, [trained[name] for name in reached])
@@ -46,14 +46,27 @@ class _Objective(nn.Module):
         self.forward = objective
 
 
-def _together(network: nn.Module, objective: Objective, minibatches: Any, parameters: dict[str, th.Tensor]) -> list[th.Tensor]:
+def _together(
+    network: nn.Module, objective: Objective, minibatches: Any, parameters: dict[str, nn.Parameter]
+) -> list[th.Tensor]:
     module = _Objective(network, objective)
+    names = {parameter: name for name, parameter in parameters.items()}
+    # Each place that holds one of them, once. Left to find the places by itself, `functional_call` does not put the parameters
+    # back into a module of several names, such as SB3's shared features extractor.
+    places = {
+        f"{path}.{place}": names[parameter]
+        for path, child in module.named_modules()
+        for place, parameter in child.named_parameters(recurse=False, remove_duplicate=False)
+        if parameter in names
+    }
 
-    def value(parameters: dict[str, th.Tensor], minibatch: Any) -> th.Tensor:
-        return functional_call(module, {f"network.{name}": tensor for name, tensor in parameters.items()}, (minibatch,))
+    def value(tensors: dict[str, th.Tensor], minibatch: Any) -> th.Tensor:
+        placed = {place: tensors[name] for place, name in places.items()}
+        return functional_call(module, placed, (minibatch,), tie_weights=False)
 
     with _unvalidated_distributions():
-        gradients = vmap(grad(value), in_dims=(None, 0))(parameters, minibatches)
+        detached = {name: parameter.detach() for name, parameter in parameters.items()}
+        gradients = vmap(grad(value), in_dims=(None, 0))(detached, minibatches)
     return list(gradients.values())
 
 

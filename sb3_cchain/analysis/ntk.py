@@ -101,7 +101,8 @@ def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
         return obs_as_tensor(array[np.divmod(indices, buffer.n_envs)], model.device)
 
     advantages = minibatches_of((buffer.advantages - buffer.advantages.mean()) / (buffer.advantages.std() + 1e-8))
-    actions = minibatches_of(buffer.actions)
+    # As the buffer's own minibatches have them: those of MultiBinary are kept as integers
+    actions = minibatches_of(buffer.actions.astype(np.float32, copy=False))
     if isinstance(model.action_space, spaces.Discrete):
         actions = actions.long().flatten(start_dim=1)
     minibatches: tuple[Any, ...] = (minibatches_of(buffer.observations), actions, advantages)

@@ -23,7 +23,7 @@ class NTKCallback(TrainingInterval):
     Logs the empirical neural tangent kernel (NTK), Section 5.2 and Appendix B of the C-CHAIN paper
     (https://arxiv.org/abs/2506.00592), whose rank falls, by the paper, as plasticity is lost: of the policy over m minibatches
     of each rollout with on-policy algorithms (:func:`~sb3_cchain.analysis.ntk.policy_ntk`), of the action values over m
-    transitions of the replay buffer with DQN (:func:`~sb3_cchain.analysis.ntk.q_ntk`).
+    transitions of the replay buffer with DQN and QRDQN (:func:`~sb3_cchain.analysis.ntk.q_ntk`).
 
     Logged, of the matrix :math:`N` of size m:
 
@@ -50,7 +50,8 @@ class NTKCallback(TrainingInterval):
     :param path: Folder of the PNG files; by default ``ntk`` in the folder of the logs, if the model has ``tensorboard_log`` or
         was given a logger by ``set_logger()``
     :raises ValueError: Naming the argument that is out of its range
-    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, and for recurrent policies
+    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN or QRDQN, and for recurrent
+        policies
     """
 
     model: OnPolicyAlgorithm | DQN
@@ -73,16 +74,16 @@ class NTKCallback(TrainingInterval):
         self.delta = delta
         self.picture_interval = picture_interval
         self.path = None if path is None else Path(path)
+        self._n_matrices = 0
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, (OnPolicyAlgorithm, DQN)) and not hasattr(self.model, "quantile_net"):
-            raise TypeError(f"NTKCallback is for on-policy algorithms and DQN, got {type(self.model).__name__}")
+            raise TypeError(f"NTKCallback is for on-policy algorithms, DQN and QRDQN, got {type(self.model).__name__}")
         if hasattr(self.model, "_last_lstm_states"):
             raise TypeError(f"NTKCallback does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._n_matrices = 0
         # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
         has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
         folder = self.logger.get_dir() if has_folder else None

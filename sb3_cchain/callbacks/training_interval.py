@@ -29,13 +29,14 @@ class TrainingInterval(BaseCallback):
             check_number("interval", interval, 1, integer=True)
         self.interval = interval
         self._defaults = default_on_policy, default_off_policy
+        # Not begun anew when `learn()` is called again
+        self._has_looked = False
 
     def _on_training_start(self) -> None:
         add_overview(self.model)
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
         self._interval = self.interval or self._defaults[0 if on_policy else 1]
         self._n_trained = self._count()
-        self._has_looked = False
 
     def _on_step(self) -> bool:
         return True
