@@ -1,6 +1,7 @@
 """CChainPPO runs wherever PPO does, and says what it does."""
 
 import csv
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -236,8 +238,27 @@ def test_callback_leaves_nothing_behind_when_training_fails():
     callback.churn_reducer.old_outputs.fill_(float("nan"))
     with pytest.raises(ValueError, match="The churn loss is nan"):
         model.learn(32, callback=callback)
-    assert not {"train", "zero_grad", "get"} & {*vars(model), *vars(model.policy.optimizer), *vars(model.rollout_buffer)}
+    left = {*vars(model), *vars(model.policy.optimizer), *vars(model.rollout_buffer)}
+    assert not {"train", "_excluded_save_params", "zero_grad", "get"} & left
     model.learn(32)
+
+
+@pytest.mark.parametrize("n_callbacks", [1, 2])
+def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(n_callbacks, tmp_path):
+    class Save(BaseCallback):
+        def _on_rollout_end(self):
+            self.model.save(tmp_path / "model")
+
+        def _on_step(self):
+            return True
+
+    callbacks = [CChainCallback() for _ in range(n_callbacks)]
+    PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=[*callbacks, Save()])
+    loaded = PPO.load(tmp_path / "model", env=make_vec_env("CartPole-v1"), device="cpu")
+    assert not {"train", "_excluded_save_params"} & set(vars(loaded))
+    before = deepcopy(loaded.policy.state_dict())
+    loaded.learn(64)
+    assert not th.equal(before["action_net.weight"], loaded.policy.action_net.weight)
 
 
 def test_callback_goes_on_with_its_history_and_may_be_given_twice():

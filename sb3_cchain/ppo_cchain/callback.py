@@ -10,6 +10,9 @@ from sb3_cchain.callbacks.tensorboard_overview import add_overview
 from sb3_cchain.churn import make_coefficient
 from sb3_cchain.common.on_policy_churn import check_choices, make_policy_reducer, reduced_churn
 
+# Methods of the model, from the end of a rollout to train()
+REPLACED = ("train", "_excluded_save_params")
+
 
 class CChainCallback(BaseCallback):
     """
@@ -83,14 +86,17 @@ class CChainCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         if self.churn_reducer.coefficient.is_zero:
             return
-        train = self.model.train
+        train, not_saved = self.model.train, [*self.model._excluded_save_params(), *REPLACED]
 
         def train_once() -> None:
-            vars(self.model).pop("train", None)  # first, so that it is gone when train() fails, too
+            self._on_training_end()  # first, so that it is gone when train() fails, too
             with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
                 train()
 
         self.model.train = train_once  # type: ignore[method-assign]
+        # A model that is saved at this point must not take it along: loaded, it would train the model that it came from
+        self.model._excluded_save_params = lambda: not_saved  # type: ignore[method-assign]
 
     def _on_training_end(self) -> None:
-        vars(self.model).pop("train", None)
+        for name in REPLACED:
+            vars(self.model).pop(name, None)
