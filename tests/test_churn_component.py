@@ -39,6 +39,18 @@ def test_nothing_lies_along_a_gradient_of_zeros():
     assert gradient_component(churn, base, "orthogonal")[0].tolist() == [1.0, 2.0]
 
 
+def test_a_component_that_there_is_not():
+    with pytest.raises(ValueError, match="`component` must be one of 'full', 'projection', 'orthogonal', got 'projecton'"):
+        gradient_component([th.ones(1)], [th.ones(1)], "projecton")
+
+
+@pytest.mark.parametrize("argument", ["churn_component", "churn_base_loss"])
+def test_a_choice_that_there_is_not_is_refused_on_loading(argument, tmp_path):
+    CChainPPO("MlpPolicy", "CartPole-v1", **SETTINGS).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"`{argument}` must be one of .*got 'none'"):
+        CChainPPO.load(tmp_path / "model", **{argument: "none"})
+
+
 def test_added_during_the_backward_pass_of_the_base_loss():
     shared, only_churn, only_base, unused = (th.tensor([value], requires_grad=True) for value in (1.0, 2.0, 3.0, 4.0))
     with component_backward([shared, only_churn, only_base, unused], "orthogonal") as backward:
@@ -48,6 +60,9 @@ def test_added_during_the_backward_pass_of_the_base_loss():
         (4 * shared + 100 * only_base).sum().backward()
         assert [shared.grad.item(), only_churn.grad.item(), only_base.grad.item()] == [4.0, 1.0, 100.0]
         assert unused.grad is None
+        # Once in an update, however many backward passes it has
+        shared.sum().backward()
+        assert [shared.grad.item(), only_churn.grad.item()] == [5.0, 1.0]
         # The next update
         for parameter in (shared, only_churn, only_base):
             parameter.grad = None

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch as th
@@ -19,7 +18,10 @@ def gradient_component(churn: Sequence[th.Tensor], base: Sequence[th.Tensor], co
     :param base: Gradient of the base loss, :math:`g`, of the same shapes
     :param component: ``"projection"``, ``"orthogonal"``, or ``"full"`` for their sum
     :return: The component, a tensor for each parameter
+    :raises ValueError: For any other component
     """
+    if component not in COMPONENTS:
+        raise ValueError(f"`component` must be one of {', '.join(map(repr, COMPONENTS))}, got {component!r}")
     if component == "full":
         return list(churn)
     # In double precision: the square of a small gradient's norm is 0 in single precision
@@ -50,7 +52,7 @@ def component_backward(parameters: Sequence[th.Tensor], component: str) -> Itera
     def backward(churn_loss: th.Tensor) -> None:
         nonlocal hook
         if hook is not None:
-            hook.remove()  # of the update before; autograd.grad() cannot run with it
+            hook.remove()  # of an update that had no backward pass; autograd.grad() cannot run with it
         trained = [parameter for parameter in parameters if parameter.requires_grad]
         gradients = th.autograd.grad(churn_loss, trained, allow_unused=True)
         reached = [
@@ -58,7 +60,11 @@ def component_backward(parameters: Sequence[th.Tensor], component: str) -> Itera
         ]
         if reached:
             reached_parameters, churn = zip(*reached, strict=True)
-            add = partial(_add_component, reached_parameters, churn, component)
+
+            def add(base: Sequence[th.Tensor | None]) -> None:
+                hook.remove()  # once, however many backward passes the update has
+                _add_component(reached_parameters, churn, component, base)
+
             hook = th.autograd.graph.register_multi_grad_hook(reached_parameters, add)
 
     try:

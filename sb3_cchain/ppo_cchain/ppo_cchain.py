@@ -59,6 +59,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
         super().__init__(*args, **kwargs)
 
     def _make_churn_reducer(self) -> ChurnReducer:
+        check_choices(self.churn_base_loss, self.churn_component)  # given to load(), they come by here alone
         return make_policy_reducer(self, self._make_churn_coefficient)
 
     def train(self) -> None:
