@@ -96,7 +96,9 @@ class ChurnMonitor(BaseCallback):
         find_outputs(self.model)
 
     def _on_training_start(self) -> None:
-        self._on_training_end()  # of training that was interrupted
+        # Of training that was interrupted, maybe of another model
+        self._attached.close()
+        self._window = {}
         add_overview(self.model)
         if self.locals.get("async_eval") is not None:
             raise ValueError("ChurnMonitor does not see the observations of ARS with `async_eval`: set it to None")
