@@ -170,3 +170,14 @@ def test_activity_where_the_next_layers_receive_it():
     branches = Functional()
     (hidden,) = hidden_activity(branches, list(find(branches, 2).values()), lambda: branches(inputs[:, 0, 0, :2]))
     assert th.allclose(hidden, F.relu(branches.first(inputs[:, 0, 0, :2])).mean(dim=0))
+
+
+def test_activations_that_write_into_what_they_are_given():
+    network, in_place = (
+        nn.Sequential(nn.Linear(3, 4), nn.ReLU(inplace), nn.Linear(4, 5), nn.LeakyReLU(inplace=inplace), nn.Linear(5, 1))
+        for inplace in (False, True)
+    )
+    layers, same = find(network, 3), find(in_place, 3)
+    assert list(layers) == list(same) == ["0", "2"]
+    for name, layer in layers.items():
+        assert all(th.equal(source, same[name].outgoing[reached]) for reached, source in layer.outgoing.items())

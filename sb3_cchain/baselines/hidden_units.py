@@ -60,7 +60,8 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
     def send_tags(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> th.Tensor | None:
         if module in tag_of:
             arrived[module] = _channels_last(module, inputs[0])
-            return tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
+            tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
+            return tagged.clone()  # for activations that write into what they are given
         if isinstance(module, CReLU):
             return th.cat([inputs[0], inputs[0]], dim=1)
         if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
