@@ -102,6 +102,9 @@ def main(arguments: Sequence[str]) -> None:
     args = parser.parse_args(arguments)
     if len(args.models) > 2:
         parser.error(f"one model, or two to compare; got {len(args.models)}")
+    for option, number in (("--n-steps", args.n_steps), ("--n-updates", args.n_updates)):
+        if number < 1:
+            parser.error(f"{option} must be at least 1; got {number}")
     for path in args.models:
         if not path.is_file():
             parser.error(f"no such file: {path}")

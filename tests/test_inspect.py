@@ -113,6 +113,13 @@ def test_task_of_a_continual_environment(algorithm, tmp_path, monkeypatch, capsy
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--n-steps", "--n-updates"])
+def test_numbers_are_checked_before_work_starts(option, tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        inspect(monkeypatch, tmp_path / "no model", "--env", "CartPole-v1", option, 0)
+    assert f"{option} must be at least 1; got 0" in capsys.readouterr().err
+
+
 def test_model_of_rl_zoo(tmp_path, monkeypatch):
     """Wrappers, arguments and statistics are those of training."""
     settings = tmp_path / "settings.yml"
