@@ -23,6 +23,7 @@ from benchmarks.runs import shipped_hyperparameters
 from benchmarks.suites import SUITES
 from benchmarks.tables import (
     MISSING,
+    digits_of,
     label_of,
     lengths_table,
     listed,
@@ -33,6 +34,7 @@ from benchmarks.tables import (
     ntk_table,
     results_table,
     score_matrices,
+    tasks_table,
 )
 
 TITLES = {
@@ -273,12 +275,16 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, folder:
     parts = [
         "### Learning curves",
         f"The mean{smooth} over all seeds of each method, with a band of ± one standard error; a single seed has no band. "
-        "Dashed: the task switches.",
+        "Dashed: the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
     ]
     for env_id, runs in _by_env(results, paper).items():
         picture = f"{PICTURES}/curves_{env_id.replace('/', '-')}.png"
         plot_learning_curves(runs, folder / picture, window, SUITES[suite].own_scales)
-        parts += [f"{name_of(env_id)}:", f"![Learning curves in {name_of(env_id)}]({picture})"]
+        parts += [
+            f"{name_of(env_id)}:",
+            f"![Learning curves in {name_of(env_id)}]({picture})",
+            tasks_table(runs, digits_of(paper)),
+        ]
     return parts
 
 

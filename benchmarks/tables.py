@@ -72,8 +72,7 @@ def results_table(suite: str, cells: Cells, paper: Table) -> str:
     :return: For each environment, J(T) here, its interval, the paper's and the seeds; and the aggregates
     """
     methods = methods_of(cells, paper)
-    means = [figure.mean for (env_id, _), figure in paper.figures.items() if env_id != AGGREGATE]
-    digits = 1 if max(map(abs, means)) >= 100 else 2
+    digits = digits_of(paper)
     rows = []
     for env_id in paper.lengths:
         of_env = {method: cells[env_id, method] for method in methods if (env_id, method) in cells}
@@ -177,6 +176,29 @@ def ntk_table(results: Sequence[Result]) -> str:
                 means = [MISSING if math.isnan(mean) else f"{mean:.3g}" for mean in np.mean(per_seed, axis=0)]
                 rows.append([quantity.label, LABELS[runs[0].algo], listed(sorted(run.seed for run in runs)), *means])
     return markdown_table(["", "method", "seeds", *results[0].task_names], rows)
+
+
+def tasks_table(results: Sequence[Result], digits: int) -> str:
+    """
+    :param results: Runs in one environment
+    :param digits: Behind the point
+    :return: J(T_i) of each run and task, and J(T)
+    """
+    rows = []
+    for result in sorted(results, key=lambda result: (METHODS.index(result.method), result.seed)):
+        averages = result.task_averages()
+        cells = [MISSING if math.isnan(mean) else f"{mean:.{digits}f}" for mean in (*averages, float(np.mean(averages)))]
+        rows.append([LABELS[result.algo], str(result.seed), *cells])
+    return markdown_table(["method", "seed", *results[0].task_names, "J(T)"], rows)
+
+
+def digits_of(paper: Table) -> int:
+    """
+    :param paper: The paper's table
+    :return: How many figures behind the point returns of this size are told with
+    """
+    means = [figure.mean for (env_id, _), figure in paper.figures.items() if env_id != AGGREGATE]
+    return 1 if max(map(abs, means)) >= 100 else 2
 
 
 def _sums(sums: Mapping[str, float], methods: Sequence[str], digits: int) -> list[str]:

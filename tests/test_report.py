@@ -23,7 +23,7 @@ from benchmarks.report import main, write_report
 from benchmarks.results import METHODS, Result, in_json, read_results, result_path, write_result
 from benchmarks.runs import shipped_hyperparameters
 from benchmarks.suites import ALL_ENVS, SUITES
-from benchmarks.tables import aggregates, mark_differences, ntk_table, results_table, score_matrices
+from benchmarks.tables import aggregates, mark_differences, ntk_table, results_table, score_matrices, tasks_table
 
 ACROBOT, CARTPOLE = "Continual/Acrobot-v1", "Continual/CartPole-v1"
 VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
@@ -261,6 +261,19 @@ def test_table_by_hand(tmp_path):
     assert rows[-2:] == [
         ["aggregate", "here", *["–"] * 6],
         ["", "paper", "-147.3", "-1157.0", "-407.3", "-291.0", "<ins>-244.0</ins>", "**-221.2**"],
+    ]
+
+
+def test_table_of_tasks_by_hand(tmp_path):
+    write(tmp_path, "cchain", [[-10, -20], [-40]])
+    write(tmp_path, "vanilla", [[-1], []], seed=1)
+    write(tmp_path, "vanilla", [[-1], [-2]], seed=0)
+    assert table_rows(tasks_table(read_results(tmp_path), 1)) == [
+        ["method", "seed", "task 0", "task 1", "J(T)"],
+        ["---"] * 5,
+        ["PPO", "0", "-1.0", "-2.0", "-1.5"],
+        ["PPO", "1", "-1.0", "–", "–"],
+        ["C-CHAIN PPO", "0", "-15.0", "-40.0", "-27.5"],
     ]
 
 
