@@ -167,15 +167,13 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
     if different:
         notes.append("\n".join(different))
     most = max((cell.seeds for cell in cells.values()), key=len, default=[])
-    if fewer := [
-        f"- {name_of(env_id)}, {label_of(suite, method)}: {listed(cell.seeds)}"
-        for (env_id, method), cell in cells.items()
-        if len(cell.seeds) < len(most)
-    ]:
-        notes.append(
-            f"Not all of the seeds {listed(most)} finished, for want of time or because they failed, in:\n\n"
-            + "\n".join(fewer)
-        )
+    fewer: dict[str, list[str]] = {}
+    for (env_id, method), cell in cells.items():
+        if len(cell.seeds) < len(most):
+            fewer.setdefault(listed(cell.seeds), []).append(f"{name_of(env_id)} {label_of(suite, method)}")
+    if fewer:
+        lines = "\n".join(f"- {seeds} alone: {', '.join(names)}" for seeds, names in fewer.items())
+        notes.append(f"Not all of the seeds {listed(most)} finished, for want of time or because they failed:\n\n{lines}")
     if left_out:
         notes.append("Left out, as their J(T) is not defined:\n\n" + "\n".join(f"- {reason}" for reason in left_out))
     return notes
