@@ -465,7 +465,7 @@ def test_seeds_that_lack_are_told(tmp_path):
     write_report(read_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
     assert (
-        "Not all of the seeds 0 1 finished, for want of time or because they failed, in:\n\n- Acrobot-v1, Oracle: 0\n\n"
+        "Not all of the seeds 0 1 finished, for want of time or because they failed:\n\n- 0 alone: Acrobot-v1 Oracle\n\n"
         in text
     )
 
