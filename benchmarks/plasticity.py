@@ -7,7 +7,7 @@ writes a table and a picture. The same command goes on where it was interrupted.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks.curves import smoothed
 from benchmarks.runs import Run, complete, shipped_hyperparameters
@@ -28,6 +27,10 @@ MONITORS = [
     "sb3_cchain.analysis.NTKCallback",
     "sb3_cchain.analysis.NetworkHealth",
 ]
+
+
+# Of a run, environment steps and values of each scalar, ``(2, n)``, by its tag
+Series = dict[str, np.ndarray]
 
 
 class Variant(NamedTuple):
@@ -65,27 +68,28 @@ FIGURES = [
 ]
 
 
-def scalars(run: Run, tag: str) -> tuple[np.ndarray, np.ndarray]:
+def series_of(run: Run) -> Series:
     """
     :param run: A finished run
-    :param tag: Name of a scalar in TensorBoard
-    :return: Environment steps of the rollout that it belongs to, and values; none where it was not logged
+    :return: Of each figure, by its tag, environment steps of the rollouts that the values belong to, and values, ``(2, n)``;
+        none where it was not logged
     """
-    (events,) = run.folder.glob("tensorboard/*/*/events.out.tfevents.*")
-    accumulator = EventAccumulator(str(events), size_guidance={"scalars": 0, "images": 1})
-    accumulator.Reload()
-    if tag not in accumulator.Tags()["scalars"]:
-        return np.array([]), np.array([])
-    steps, values = np.array([(event.step, event.value) for event in accumulator.Scalars(tag)]).T
-    if tag.startswith("churn"):
-        # SB3 writes what `train()` logs at the end of the next rollout
-        steps -= np.diff([event.step for event in accumulator.Scalars("ntk/srank")]).min()
-    return steps, values
+    logged: dict[str, list[tuple[int, float]]] = {figure.tag: [] for figure in FIGURES}
+    for row in run.scalars(tuple(logged)):
+        if row["name"] in logged:  # and does not only begin like one of them
+            logged[row["name"]].append((row["timesteps"], float(row["value"])))
+    series = {tag: np.array(rows).reshape(-1, 2).T for tag, rows in logged.items()}
+    for tag, (steps, _) in series.items():
+        if tag.startswith("churn") and len(steps):
+            # SB3 writes what `train()` logs at the end of the next rollout
+            steps -= np.diff(series["ntk/srank"][0]).min()
+    return series
 
 
-def table(runs: dict[str, list[Run]]) -> str:
+def table(runs: dict[str, list[Run]], series: Mapping[Run, Series]) -> str:
     """
     :param runs: Finished runs of each variant
+    :param series: What each of them logged
     :return: For each figure and variant its mean over the logs of each task, for each of the seeds
     """
     run = next(iter(runs.values()))[0]
@@ -94,7 +98,7 @@ def table(runs: dict[str, list[Run]]) -> str:
         for name, of_variant in runs.items():
             per_seed = []
             for run in of_variant:
-                steps, values = scalars(run, figure.tag)
+                steps, values = series[run][figure.tag]
                 task = (steps - 1) // run.steps_per_task  # the rollout that ends a task is still of that task
                 per_seed.append([values[task == i].mean() if (task == i).any() else np.nan for i in range(run.n_tasks)])
             cells = [" / ".join(f"{mean:.3g}" for mean in of_task) for of_task in zip(*per_seed, strict=True)]
@@ -102,11 +106,12 @@ def table(runs: dict[str, list[Run]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def plot(runs: dict[str, list[Run]], path: Path, title: str, window: int = 5) -> None:
+def plot(runs: dict[str, list[Run]], series: Mapping[Run, Series], path: Path, title: str, window: int = 5) -> None:
     """
     A panel for each figure: a line per run, and the task switches.
 
     :param runs: Finished runs of each variant
+    :param series: What each of them logged
     :param path: PNG file
     :param title: Title
     :param window: Logs that the running mean goes over
@@ -116,7 +121,7 @@ def plot(runs: dict[str, list[Run]], path: Path, title: str, window: int = 5) ->
     run = next(iter(runs.values()))[0]
     for panel, figure in zip(axes.T.flat, FIGURES, strict=True):
         for name, of_variant in runs.items():
-            curves = [(steps, smoothed(values, window)) for steps, values in (scalars(run, figure.tag) for run in of_variant)]
+            curves = [(steps, smoothed(values, window)) for steps, values in (series[run][figure.tag] for run in of_variant)]
             curves = [curve for curve in curves if len(curve[0])]
             if not curves:
                 continue
@@ -187,9 +192,12 @@ def main() -> None:
         for name in args.variants
     }
     complete([of_variant[i] for i in range(len(args.seeds)) for of_variant in runs.values()], args.jobs)
-    (folder / "table.md").write_text(table(runs) + "\n")
-    plot(runs, folder / "plasticity.png", f"{args.env}, {len(args.seeds)} seeds" if len(args.seeds) > 1 else args.env)
-    print(f"{table(runs)}\n\nWritten: {folder}/table.md, {folder}/plasticity.png")
+    series = {run: series_of(run) for of_variant in runs.values() for run in of_variant}
+    means = table(runs, series)
+    (folder / "table.md").write_text(means + "\n")
+    title = f"{args.env}, {len(args.seeds)} seeds" if len(args.seeds) > 1 else args.env
+    plot(runs, series, folder / "plasticity.png", title)
+    print(f"{means}\n\nWritten: {folder}/table.md, {folder}/plasticity.png")
 
 
 if __name__ == "__main__":
