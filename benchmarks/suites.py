@@ -97,11 +97,7 @@ SUITES = {
         visible=False,
     ),
     "procgen": Suite(
-        [
-            env_id
-            for env_id, kwargs in zip(ALL_ENVS, CONTINUAL_ENVS.values(), strict=True)
-            if "game" in kwargs.get("kwargs", {})
-        ],
+        PROCGEN_ENVS,
         lambda env, task: f"level {env.levels[task].start}",
         others=(
             *("ppo_oracle", "ppo_trac", "ppo_weight_clipping", "ppo_l2_init"),
