@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-import yaml
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -28,6 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
+from benchmarks.runs import shipped_hyperparameters
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.baselines import (
     TRAC,
@@ -44,7 +44,6 @@ from sb3_cchain.baselines import (
     ShrinkAndPerturb,
     WeightClipping,
 )
-from sb3_cchain.zoo import hyperparams_folder
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
 NOT_THE_MODELS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}
@@ -83,8 +82,8 @@ def settings_of(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
     :param changed: What shall differ
     :return: The model's arguments in the shipped hyperparameters
     """
-    settings = yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text())[env_id]
-    settings = {name: value for name, value in settings.items() if name not in NOT_THE_MODELS}
+    shipped = shipped_hyperparameters(algo, env_id) or {}
+    settings = {name: value for name, value in shipped.items() if name not in NOT_THE_MODELS}
     # As RL Zoo reads it
     if "policy_kwargs" in settings:
         settings["policy_kwargs"] = eval(settings["policy_kwargs"], {"nn": nn, "get_class_by_name": get_class_by_name})
