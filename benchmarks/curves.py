@@ -12,6 +12,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from benchmarks.markdown import markdown_table
 from benchmarks.runs import Run
 from benchmarks.suites import Suite, Task
 from sb3_cchain.callbacks.continual_metrics import task_averages
@@ -70,7 +71,7 @@ def _figures(averages: Sequence[float] | np.ndarray) -> list[str]:
     return [f"{average:.0f}" if abs(average) >= 100 else f"{average:.1f}" for average in [*averages, np.mean(averages)]]
 
 
-def markdown_table(runs: Sequence[Run], returns: Returns = Run.returns, random_returns: Sequence[float] | None = None) -> str:
+def returns_table(runs: Sequence[Run], returns: Returns = Run.returns, random_returns: Sequence[float] | None = None) -> str:
     """
     :param runs: Finished runs of one environment and length
     :param returns: Which returns
@@ -79,13 +80,13 @@ def markdown_table(runs: Sequence[Run], returns: Returns = Run.returns, random_r
     """
     n_tasks = runs[0].n_tasks
     header = ["algorithm", "seed", *(f"task {task}" for task in range(n_tasks)), "J(T)"]
-    lines = [header, ["---"] * len(header), *(row_of(run, returns) for run in runs)]
+    rows = [row_of(run, returns) for run in runs]
     for algo in dict.fromkeys(run.algo for run in runs):
         averages = np.mean([averages_of(run, returns) for run in runs if run.algo == algo], axis=0)
-        lines.append([f"**{cell}**" for cell in (LABELS[algo], "mean", *_figures(averages))])
+        rows.append([f"**{cell}**" for cell in (LABELS[algo], "mean", *_figures(averages))])
     if random_returns is not None:
-        lines.append(["random policy", "", *_figures(random_returns)])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        rows.append(["random policy", "", *_figures(random_returns)])
+    return markdown_table(header, rows)
 
 
 def cost_table(runs: Sequence[Run]) -> str:
@@ -93,11 +94,11 @@ def cost_table(runs: Sequence[Run]) -> str:
     :param runs: Finished runs
     :return: A row per run: environment steps per second, and peak memory
     """
-    lines = [["algorithm", "seed", "steps per second", "peak memory"], ["---"] * 4]
+    rows = []
     for run in runs:
         steps_per_second, memory = run.cost
-        lines.append([LABELS[run.algo], str(run.seed), f"{steps_per_second:.0f}", f"{memory:.1f} GB"])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        rows.append([LABELS[run.algo], str(run.seed), f"{steps_per_second:.0f}", f"{memory:.1f} GB"])
+    return markdown_table(["algorithm", "seed", "steps per second", "peak memory"], rows)
 
 
 def smoothed(values: np.ndarray, window: int) -> np.ndarray:
@@ -205,7 +206,7 @@ def report(suite: Suite, runs: Sequence[Run], folder: Path, tasks: Sequence[Task
     :param tasks: The tasks of the runs
     """
     runs = sorted(runs, key=lambda run: (list(LABELS).index(run.algo), run.seed))
-    tables = f"{markdown_table(runs, suite.returns, [task.random_return for task in tasks])}\n\n{cost_table(runs)}"
+    tables = f"{returns_table(runs, suite.returns, [task.random_return for task in tasks])}\n\n{cost_table(runs)}"
     (folder / "table.md").write_text(tables + "\n")
     plot_suite(suite, runs, folder / "curves.png", runs[0].env_id, tasks)
     print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")

@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.curves import smoothed
+from benchmarks.markdown import markdown_table
 from benchmarks.runs import Run, complete, shipped_hyperparameters
 from benchmarks.suites import SUITES
 
@@ -93,7 +94,7 @@ def table(runs: dict[str, list[Run]], series: Mapping[Run, Series]) -> str:
     :return: For each figure and variant its mean over the logs of each task, for each of the seeds
     """
     run = next(iter(runs.values()))[0]
-    lines = [["", "", *(f"task {task}" for task in range(run.n_tasks))], ["---"] * (run.n_tasks + 2)]
+    rows = []
     for figure in FIGURES:
         for name, of_variant in runs.items():
             per_seed = []
@@ -102,8 +103,8 @@ def table(runs: dict[str, list[Run]], series: Mapping[Run, Series]) -> str:
                 task = (steps - 1) // run.steps_per_task  # the rollout that ends a task is still of that task
                 per_seed.append([values[task == i].mean() if (task == i).any() else np.nan for i in range(run.n_tasks)])
             cells = [" / ".join(f"{mean:.3g}" for mean in of_task) for of_task in zip(*per_seed, strict=True)]
-            lines.append([figure.label, VARIANTS[name].label, *cells])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+            rows.append([figure.label, VARIANTS[name].label, *cells])
+    return markdown_table(["", "", *(f"task {task}" for task in range(run.n_tasks))], rows)
 
 
 def plot(runs: dict[str, list[Run]], series: Mapping[Run, Series], path: Path, title: str, window: int = 5) -> None:

@@ -16,6 +16,7 @@ from benchmarks.cells import Cells, cells_of, in_words
 from benchmarks.curves import LABELS
 from benchmarks.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
 from benchmarks.figures import NTK, plot_learning_curves, plot_ntk, plot_reliable_metrics
+from benchmarks.markdown import markdown_table
 from benchmarks.page import html_page
 from benchmarks.paper import AGGREGATE, Table, read_tables
 from benchmarks.results import METHODS, Result, in_json, read_results
@@ -28,7 +29,6 @@ from benchmarks.tables import (
     lengths_table,
     listed,
     mark_differences,
-    markdown_table,
     methods_of,
     name_of,
     ntk_table,

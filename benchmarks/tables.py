@@ -9,20 +9,12 @@ from benchmarks.cells import Cell, Cells
 from benchmarks.curves import LABELS
 from benchmarks.estimates import agrees, best_two
 from benchmarks.figures import NTK, metric_of_task
+from benchmarks.markdown import markdown_table
 from benchmarks.paper import AGGREGATE, Table
 from benchmarks.results import METHODS, Result
 from benchmarks.suites import SUITES
 
 MISSING = "–"
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """
-    :param header: Names of the columns
-    :param rows: Cells
-    :return: In Markdown
-    """
-    return "\n".join(f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows])
 
 
 def label_of(suite: str, method: str) -> str:

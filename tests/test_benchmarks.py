@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.curves import COLORS, LABELS, averages_of, cost_table, markdown_table, plot_curves, report, smoothed
+from benchmarks.curves import COLORS, LABELS, averages_of, cost_table, plot_curves, report, returns_table, smoothed
 from benchmarks.runs import DONE, Run, complete
 from benchmarks.suites import ALL_ENVS, SUITES, Task, look_at
 from sb3_cchain.zoo import METHODS
@@ -33,7 +33,7 @@ def test_table_by_hand(tmp_path):
         make_run(tmp_path, seed=1, rows="800,0,1,-5.0\n2400,1,1,0.0\n"),
         make_run(tmp_path, "ppo_cchain"),
     ]
-    assert markdown_table(runs).splitlines() == [
+    assert returns_table(runs).splitlines() == [
         "| algorithm | seed | task 0 | task 1 | J(T) |",
         "| --- | --- | --- | --- | --- |",
         "| PPO | 0 | -15.0 | -40.0 | -27.5 |",
@@ -45,7 +45,7 @@ def test_table_by_hand(tmp_path):
 
 
 def test_random_policy_in_the_table(tmp_path):
-    table = markdown_table([make_run(tmp_path)], random_returns=[-300.0, -1.0])
+    table = returns_table([make_run(tmp_path)], random_returns=[-300.0, -1.0])
     assert table.splitlines()[-1] == "| random policy |  | -300 | -1.0 | -150 |"
 
 
@@ -56,7 +56,7 @@ def test_evaluations_by_task(tmp_path):
     np.savez(folder / "evaluations.npz", timesteps=[800, 1600, 2400], results=[[1.0, 3.0], [5.0, 5.0], [8.0, 0.0]])
     assert [tuple(row.values()) for row in run.evaluations()] == [(800, 0, 2, 2.0), (1600, 0, 2, 5.0), (2400, 1, 2, 4.0)]
     assert averages_of(run, Run.evaluations) == [3.5, 4.0]
-    assert markdown_table([run], Run.evaluations).splitlines()[2] == "| PPO | 0 | 3.5 | 4.0 | 3.8 |"
+    assert returns_table([run], Run.evaluations).splitlines()[2] == "| PPO | 0 | 3.5 | 4.0 | 3.8 |"
 
 
 def test_suites_cover_the_environments():
