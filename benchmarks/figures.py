@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 
@@ -14,27 +14,10 @@ from rliable.plot_utils import plot_interval_estimates
 
 from benchmarks.curves import COLORS, LABELS, smoothed
 from benchmarks.estimates import METRICS
-from benchmarks.results import METHODS, Result
-
-# Environment steps and values of one run
-Series = tuple[np.ndarray, np.ndarray]
+from benchmarks.quantities import NTK
+from benchmarks.results import METHODS, Result, Series
 
 N_POINTS = 100
-
-
-class Quantity(NamedTuple):
-    """What a panel shows: a scalar of ``metrics.csv``, its label, and whether its axis is logarithmic."""
-
-    name: str
-    label: str
-    logarithmic: bool
-
-
-NTK = (
-    Quantity("ntk/srank", "srank", False),
-    Quantity("ntk/off_diagonal_sum", "off-diagonal sum", True),
-    Quantity("ntk/diagonal_sum", "diagonal sum", True),
-)
 
 
 def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -53,29 +36,6 @@ def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[np.ndarra
     return grid, back(mean), back(mean - error), back(mean + error)
 
 
-def returns_of_task(result: Result, task: int) -> Series:
-    """
-    :param result: A run
-    :param task: Number of one of its tasks
-    :return: Its rows of ``returns.csv``: of a rollout in which the task changes, each task has its own, at the rollout's end
-    """
-    rows = [row for row in result.returns() if row["task_id"] == task]
-    return np.array([row["timesteps"] for row in rows]), np.array([row["mean_return"] for row in rows])
-
-
-def metric_of_task(result: Result, name: str, task: int) -> Series:
-    """
-    :param result: A run
-    :param name: Name of a scalar in ``metrics.csv``
-    :param task: Number of one of its tasks
-    :return: What was logged in the task: the step that ends it is still of it; of the last task, what the last rollout logged
-        beyond its end, too
-    """
-    logged = np.array(result.metrics().get(name, [])).reshape(-1, 2)
-    chosen = logged[np.searchsorted(result.task_boundaries[:-1], logged[:, 0]) == task]
-    return chosen[:, 0], chosen[:, 1]
-
-
 def plot_learning_curves(results: Sequence[Result], path: Path, window: int, own_scales: bool) -> None:
     """
     :param results: All runs in one environment
@@ -87,7 +47,7 @@ def plot_learning_curves(results: Sequence[Result], path: Path, window: int, own
     n_tasks = results[0].n_tasks
     figure, axes = plt.subplots(1, n_tasks if own_scales else 1, figsize=(9, 4), squeeze=False, layout="constrained")
     panels = list(axes[0]) if own_scales else [axes[0, 0]] * n_tasks
-    _draw(panels, results, returns_of_task, window=window)
+    _draw(panels, results, Result.returns_of_task, window=window)
     panels[0].set_ylabel("return per episode")
     for panel, name in zip(panels, results[0].task_names, strict=True) if own_scales else ():
         panel.set_title(name, fontsize="medium")
@@ -104,7 +64,7 @@ def plot_ntk(results: Sequence[Result], path: Path) -> None:
     for panel, quantity in zip(axes, NTK, strict=True):
 
         def series(result: Result, task: int, name: str = quantity.name) -> Series:
-            return metric_of_task(result, name, task)
+            return result.metric_of_task(name, task)
 
         _draw([panel] * results[0].n_tasks, results, series, logarithmic=quantity.logarithmic)
         panel.set_title(quantity.label, fontsize="medium")

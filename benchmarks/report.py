@@ -15,10 +15,11 @@ import numpy as np
 from benchmarks.cells import Cells, cells_of, in_words
 from benchmarks.curves import LABELS
 from benchmarks.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
-from benchmarks.figures import NTK, plot_learning_curves, plot_ntk, plot_reliable_metrics
+from benchmarks.figures import plot_learning_curves, plot_ntk, plot_reliable_metrics
 from benchmarks.markdown import markdown_table
 from benchmarks.page import html_page
 from benchmarks.paper import AGGREGATE, Table, read_tables
+from benchmarks.quantities import NTK
 from benchmarks.results import METHODS, Result, in_json, read_results
 from benchmarks.runs import shipped_hyperparameters
 from benchmarks.suites import SUITES
@@ -288,7 +289,7 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, folder:
 
 def _ntk_section(suite: str, results: Sequence[Result], paper: Table, folder: Path) -> list[str]:
     """The neural tangent kernel, of the runs that logged it."""
-    logged = [result for result in results if NTK[0].name in result.metrics()]
+    logged = [result for result in results if NTK[0].name in result.metrics]
     if not logged:
         return []
     parts = [

@@ -18,8 +18,11 @@ import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TextIO
+
+import numpy as np
 
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
@@ -31,6 +34,9 @@ METRICS_COLUMNS = ("timesteps", "name", "value")
 
 # Of a result's fields, those that determine the run. Not the versions, which are recorded: a result of another version is one
 SETTINGS = ("env_id", "algo", "seed", "n_tasks", "steps_per_task", "hyperparameters")
+
+# Environment steps and values of one run
+Series = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -86,16 +92,14 @@ class Result:
         """What determines the run."""
         return {name: getattr(self, name) for name in SETTINGS}
 
+    @cached_property
     def returns(self) -> list[dict[str, float]]:
-        """
-        :return: Rows of ``returns.csv``
-        """
+        """Rows of ``returns.csv``, read once."""
         return read_returns(self.path / "returns.csv")
 
+    @cached_property
     def metrics(self) -> dict[str, list[tuple[int, float]]]:
-        """
-        :return: ``metrics.csv``: environment steps and values of each scalar, by its name
-        """
+        """``metrics.csv``, read once: environment steps and values of each scalar, by its name."""
         metrics: dict[str, list[tuple[int, float]]] = {}
         with open(self.path / "metrics.csv", newline="") as file:
             for row in csv.DictReader(file):
@@ -106,8 +110,28 @@ class Result:
         """
         :return: J(T_i) of each task: the mean over its rows of their mean return; NaN where it has none
         """
-        averages = task_averages(self.returns())
+        averages = task_averages(self.returns)
         return [averages.get(task, math.nan) for task in range(self.n_tasks)]
+
+    def returns_of_task(self, task: int) -> Series:
+        """
+        :param task: Number of one of its tasks
+        :return: Its rows of ``returns.csv``: of a rollout in which the task changes, each task has its own, at the rollout's
+            end
+        """
+        rows = [row for row in self.returns if row["task_id"] == task]
+        return np.array([row["timesteps"] for row in rows]), np.array([row["mean_return"] for row in rows])
+
+    def metric_of_task(self, name: str, task: int) -> Series:
+        """
+        :param name: Name of a scalar in ``metrics.csv``
+        :param task: Number of one of its tasks
+        :return: What was logged in the task: the step that ends it is still of it; of the last task, what the last rollout
+            logged beyond its end, too
+        """
+        logged = np.array(self.metrics.get(name, [])).reshape(-1, 2)
+        chosen = logged[np.searchsorted(self.task_boundaries[:-1], logged[:, 0]) == task]
+        return chosen[:, 0], chosen[:, 1]
 
 
 def result_path(folder: Path, budget: str, suite: str, env_id: str, method: str, seed: int) -> Path:

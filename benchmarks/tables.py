@@ -8,9 +8,9 @@ import numpy as np
 from benchmarks.cells import Cell, Cells
 from benchmarks.curves import LABELS
 from benchmarks.estimates import agrees, best_two
-from benchmarks.figures import NTK, metric_of_task
 from benchmarks.markdown import markdown_table
 from benchmarks.paper import AGGREGATE, Table
+from benchmarks.quantities import NTK
 from benchmarks.results import METHODS, Result
 from benchmarks.suites import SUITES
 
@@ -162,7 +162,7 @@ def ntk_table(results: Sequence[Result]) -> str:
             runs = [result for result in results if result.method == method]
             per_seed = []
             for result in runs:
-                in_tasks = [metric_of_task(result, quantity.name, task)[1] for task in range(result.n_tasks)]
+                in_tasks = [result.metric_of_task(quantity.name, task)[1] for task in range(result.n_tasks)]
                 per_seed.append([values.mean() if len(values) else math.nan for values in in_tasks])
             if runs:
                 means = [MISSING if math.isnan(mean) else f"{mean:.3g}" for mean in np.mean(per_seed, axis=0)]

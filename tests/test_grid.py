@@ -59,7 +59,7 @@ def test_results_are_read_as_they_were_written(tmp_path):
     assert result.path == tmp_path / "smoke" / "gym_control" / "Continual-CartPole-v1" / "cchain" / "seed_0"
     write_result(result, ROWS, [{"timesteps": 800, "name": "churn/coef", "value": "1.5"}])
     assert read_results(tmp_path) == read_results(tmp_path / "smoke") == [result] == [read_result(result.path)]
-    assert result.returns() == ROWS and result.metrics() == {"churn/coef": [(800, 1.5)]}
+    assert result.returns == ROWS and result.metrics == {"churn/coef": [(800, 1.5)]}
     averages = result.task_averages()
     assert averages[0] == 25.0 and averages[1] != averages[1]
     assert sorted(file.name for file in result.path.iterdir()) == ["metrics.csv", "returns.csv", "run.json"]
@@ -88,10 +88,10 @@ def test_the_first_of_equal_results_stays_and_one_of_other_settings_is_replaced(
     first = make_result(tmp_path)
     write_result(first, ROWS, [])
     write_result(make_result(tmp_path, seconds=99.0), [], [])
-    assert read_results(tmp_path) == [first] and first.returns() == ROWS
+    assert read_results(tmp_path) == [first] and first.returns == ROWS
     other = make_result(tmp_path, steps_per_task=400)
     write_result(other, [], [])
-    assert read_results(tmp_path) == [other] and other.returns() == []
+    assert read_results(tmp_path) == [other] and other.returns == []
     assert [path.name for path in first.path.parent.iterdir()] == ["seed_0"]
 
 
@@ -101,7 +101,7 @@ def test_writers_at_once_leave_one_whole_result(tmp_path, same):
     with ThreadPoolExecutor(16) as pool:
         list(pool.map(lambda result: write_result(result, ROWS, []), results))
     (written,) = read_results(tmp_path)
-    assert written in results and written.returns() == ROWS
+    assert written in results and written.returns == ROWS
     assert [path.name for path in written.path.parent.iterdir()] == ["seed_0"]
 
 
@@ -337,8 +337,8 @@ def train_smoke(suite, env_id, method, folder):
 
 def test_a_run_and_its_result(tmp_path):
     result = train_smoke("gym_control", "Continual/CartPole-v1", "cchain", tmp_path)
-    assert [(row["timesteps"], row["task_id"]) for row in result.returns()] == [(800, 0), (1600, 1)]
-    metrics = result.metrics()
+    assert [(row["timesteps"], row["task_id"]) for row in result.returns] == [(800, 0), (1600, 1)]
+    metrics = result.metrics
     assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith("churn/") for name in metrics)
     # SB3 writes what an update logged with the rollout after it
     assert [steps for steps, _ in metrics["churn/coef"]] == [1600]
@@ -360,7 +360,7 @@ def test_a_run_and_its_result(tmp_path):
 def test_runs_of_the_other_suites(suite, env_id, method, names, tmp_path):
     result = train_smoke(suite, env_id, method, tmp_path)
     assert result.task_names == names
-    rows = result.returns()
+    rows = result.returns
     if suite == "minatar":
         assert [tuple(row.values())[:3] for row in rows] == [(200, 0, 10), (400, 1, 10)]
     assert {row["task_id"] for row in rows} <= {0, 1} and rows
@@ -501,7 +501,7 @@ def test_a_killed_grid_goes_on(tmp_path):
     assert "4 of 4 runs are done, 0 failed" in again.stdout
     assert sorted(result.seed for result in read_results(results)) == [0, 1, 2, 3]
     for cell in grid:
-        assert len(read_result(cell.path(results)).returns()) == 2
+        assert len(read_result(cell.path(results)).returns) == 2
         if cell in before:  # not again
             assert (cell.path(results) / "run.json").stat().st_mtime_ns == before[cell]
             assert attempts(cell, logs) == tried[cell]

@@ -16,7 +16,7 @@ from benchmarks.estimates import (
     probability_of_improvement,
     reliable_metrics,
 )
-from benchmarks.figures import band, metric_of_task, plot_learning_curves, returns_of_task
+from benchmarks.figures import band, plot_learning_curves
 from benchmarks.page import html_page
 from benchmarks.paper import read_tables
 from benchmarks.report import main, write_report
@@ -340,9 +340,9 @@ def test_which_task_a_metric_is_of(tmp_path):
     metrics = [(steps, "ntk/srank", value) for value, steps in enumerate((50, 100, 101, 200, 210))]
     write(tmp_path, "cchain", [[0], [0]], metrics=metrics)
     (result,) = read_results(tmp_path)
-    series = [[part.tolist() for part in metric_of_task(result, "ntk/srank", task)] for task in (0, 1)]
+    series = [[part.tolist() for part in result.metric_of_task("ntk/srank", task)] for task in (0, 1)]
     assert series == [[[50, 100], [0.0, 1.0]], [[101, 200, 210], [2.0, 3.0, 4.0]]]
-    assert metric_of_task(result, "ntk/diagonal_sum", 0)[0].size == 0
+    assert result.metric_of_task("ntk/diagonal_sum", 0)[0].size == 0
 
 
 def test_a_rollout_over_a_switch_counts_in_both_tasks(tmp_path):
@@ -351,7 +351,7 @@ def test_a_rollout_over_a_switch_counts_in_both_tasks(tmp_path):
     (result,) = read_results(tmp_path)
     rows = "timesteps,task_id,n_episodes,mean_return\n60,0,1,900\n120,0,1,910\n120,1,2,100\n240,1,1,110\n"
     (result.path / "returns.csv").write_text(rows)
-    series = [[part.tolist() for part in returns_of_task(result, task)] for task in (0, 1)]
+    series = [[part.tolist() for part in result.returns_of_task(task)] for task in (0, 1)]
     assert series == [[[60, 120], [900.0, 910.0]], [[120, 240], [100.0, 110.0]]]
 
 
