@@ -44,7 +44,9 @@ def main() -> None:
     n_tasks, steps_per_task = args.n_tasks or length[0], args.steps_per_task or length[1]
     folder = args.output / args.suite / f"{env_id.replace('/', '-')}_{n_tasks}x{steps_per_task}"
     runs = [
-        suite.run(algo, env_id, seed, n_tasks, steps_per_task, folder, args.eval_freq) for seed in args.seeds for algo in algos
+        suite.run(algo, env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", args.eval_freq)
+        for seed in args.seeds
+        for algo in algos
     ]
     complete(runs, args.jobs)
     tasks = [look_at(suite, runs[0], task, args.random_episodes) for task in range(n_tasks)]

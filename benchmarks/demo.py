@@ -71,8 +71,9 @@ def main() -> None:
     demo, suite = DEMOS[args.suite], SUITES[args.suite]
     n_tasks, steps_per_task = args.n_tasks or demo.n_tasks, args.steps_per_task or demo.steps_per_task
     name = f"{args.suite}_{n_tasks}x{steps_per_task}"
+    folder, eval_freq = args.output / name, steps_per_task // 5
     runs = [
-        suite.run(algo, demo.env_id, seed, n_tasks, steps_per_task, args.output / name, eval_freq=steps_per_task // 5)
+        suite.run(algo, demo.env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", eval_freq)
         for seed in args.seeds
         for algo in suite.algos
     ]

@@ -87,7 +87,7 @@ class Cell:
         eval_freq = self.steps_per_task if self.budget == "smoke" else None
         suite = SUITES[self.suite]
         run = suite.run(self.algo, self.env_id, self.seed, self.n_tasks, self.steps_per_task, folder, eval_freq)
-        return replace(run, folder=folder, device=device)
+        return replace(run, device=device)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -73,7 +73,7 @@ class Suite:
             same seed
         :param n_tasks: Length of the task sequence
         :param steps_per_task: Environment steps per task
-        :param folder: Parent of the run's folder
+        :param folder: Where the run's files go
         :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the
             paper
         :return: The run
@@ -85,7 +85,7 @@ class Suite:
             raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
         eval_freq = (eval_freq or steps_per_task // 30) if self.evaluates else -1
         env_kwargs = self.env_kwargs(n_tasks, seed)
-        return Run(algo, env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", env_kwargs, eval_freq)
+        return Run(algo, env_id, seed, n_tasks, steps_per_task, folder, env_kwargs, eval_freq)
 
 
 SUITES = {
