@@ -32,7 +32,7 @@ MEASURED_RATES = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class GridRun:
     """
     One run of the grid, defined by the shipped hyperparameters and nothing else.
 
@@ -73,7 +73,7 @@ class Cell:
     def path(self, folder: Path) -> Path:
         """
         :param folder: Folder of all results, or of all logs
-        :return: The cell's own in it
+        :return: The run's own in it
         """
         return result_path(folder, self.budget, self.suite, self.env_id, self.method, self.seed)
 
@@ -104,7 +104,7 @@ class Cell:
     def result(self, results: Path) -> Result | None:
         """
         :param results: Folder of all results
-        :return: The cell's, None where there is none with the present settings
+        :return: The run's, None where there is none with the present settings
         """
         result = read_result(self.path(results))
         return result if result is not None and result.settings == self.settings else None
@@ -131,13 +131,13 @@ def length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
     return n_tasks, steps // 10
 
 
-def cells(
+def grid_runs(
     suites: Sequence[str],
     env_ids: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
     n_seeds: int | None = None,
     budget: str = "paper",
-) -> list[Cell]:
+) -> list[GridRun]:
     """
     All seeds of nothing are worth less than one seed of all, so the seeds change last.
 
@@ -147,7 +147,7 @@ def cells(
         several suites, each has those that the paper compares in it
     :param n_seeds: Number of seeds, from 0; by default that of the budget
     :param budget: One of ``BUDGETS``
-    :return: The cells, in the order in which they are to run
+    :return: The runs, in the order in which they are to run
     :raises ValueError: For an environment or a method that none of the suites has, less than one seed, or when nothing is left
     """
     _check("env", env_ids, [env_id for suite in suites for env_id in SUITES[suite].env_ids], suites)
@@ -162,13 +162,13 @@ def cells(
             if env_ids is not None and env_id not in env_ids:
                 continue
             n_tasks, steps = length(suite, env_id, budget)
-            probe = Cell(suite, env_id, "vanilla", 0, budget, n_tasks, steps, ())
+            probe = GridRun(suite, env_id, "vanilla", 0, budget, n_tasks, steps, ())
             env = make_env(probe.run(Path()), 0)
             names = tuple(SUITES[suite].task_name(env.unwrapped, task) for task in range(n_tasks))
             env.close()
             order = [method for method in dict.fromkeys(methods or of_suite) if method in of_suite]
             grid += [
-                (seed, rank, Cell(suite, env_id, method, seed, budget, n_tasks, steps, names))
+                (seed, rank, GridRun(suite, env_id, method, seed, budget, n_tasks, steps, names))
                 for seed in range(seeds)
                 for rank, method in enumerate(order)
             ]
@@ -176,7 +176,7 @@ def cells(
         raise ValueError(
             f"--method must be one that is compared in {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
         )
-    return [cell for *_, cell in sorted(grid, key=lambda entry: entry[:2])]
+    return [run for *_, run in sorted(grid, key=lambda entry: entry[:2])]
 
 
 def _check(what: str, given: Iterable[str] | None, allowed: Sequence[str], suites: Sequence[str]) -> None:
@@ -190,7 +190,7 @@ def _check(what: str, given: Iterable[str] | None, allowed: Sequence[str], suite
 
 class Rates:
     """
-    How long a cell will take: from the results of its environment and method, else of its suite and method, else from
+    How long a run will take: from the results of its environment and method, else of its suite and method, else from
     ``MEASURED_RATES``. Smoke runs, which consist of their start, tell of each other alone.
 
     :param results: Results there are, of any budget
@@ -204,18 +204,18 @@ class Rates:
                 self._totals[key] = (steps + result.n_tasks * result.steps_per_task, seconds + result.seconds)
 
     @staticmethod
-    def _keys(of: Result | Cell) -> tuple[tuple, tuple]:
+    def _keys(of: Result | GridRun) -> tuple[tuple, tuple]:
         smoke = of.budget == "smoke"
         return (smoke, of.env_id, of.method), (smoke, of.suite, of.method)
 
-    def seconds(self, cell: Cell) -> float:
+    def seconds(self, run: GridRun) -> float:
         """
-        :param cell: A cell
+        :param run: A run of the grid
         :return: Seconds that it will take on one core
         """
-        for key in self._keys(cell):
+        for key in self._keys(run):
             if key in self._totals:
                 steps, seconds = self._totals[key]
-                return cell.total_steps * seconds / steps
-        rates = MEASURED_RATES[cell.suite]
-        return cell.total_steps / rates.get(cell.method, rates["vanilla"])
+                return run.total_steps * seconds / steps
+        rates = MEASURED_RATES[run.suite]
+        return run.total_steps / rates.get(run.method, rates["vanilla"])

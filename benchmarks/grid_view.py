@@ -13,27 +13,27 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from benchmarks.grid import Cell, Rates
+from benchmarks.grid import GridRun, Rates
 
 
 class Failure(NamedTuple):
     """
     Why a run failed.
 
-    :param cell: The run
+    :param run: The run
     :param reason: In one line
     :param log: Path of its log, or of the folder of its logs
     :param node: Name of the machine that it is on, None where that is not known
     """
 
-    cell: Cell
+    run: GridRun
     reason: str
     log: str
     node: str | None = None
 
     def __str__(self) -> str:
         where = "" if self.node in (None, platform.node()) else f"{self.node}:"
-        return f"{self.cell.name} failed: {self.reason}; see {where}{self.log}"
+        return f"{self.run.name} failed: {self.reason}; see {where}{self.log}"
 
 
 def duration(seconds: float) -> str:
@@ -53,15 +53,15 @@ class GridView:
     What is done, running, waiting and failed of a grid, and how long the rest will take. Ends and failures of runs are printed
     in lines of their own, which a log file gets, too; the view itself is for a terminal.
 
-    :param waiting: The cells that are not done, in their order
+    :param waiting: The runs that are not done, in their order
     :param n_done: How many are done already
     :param rates: What is known of their speed
     :param console: Where to
     """
 
-    def __init__(self, waiting: Sequence[Cell], n_done: int, rates: Rates, console: Console):
+    def __init__(self, waiting: Sequence[GridRun], n_done: int, rates: Rates, console: Console):
         self.waiting = list(waiting)
-        self.running: dict[Cell, float] = {}
+        self.running: dict[GridRun, float] = {}
         self.failures: list[Failure] = []
         self.n_before, self.n_done = n_done, n_done
         self.slots = 1
@@ -71,33 +71,33 @@ class GridView:
         self.console = console
         self.live = Live(console=console, get_renderable=self.render, refresh_per_second=1, transient=True)
 
-    def start(self, cell: Cell) -> None:
+    def start(self, run: GridRun) -> None:
         """
-        :param cell: Runs from now on
+        :param run: Runs from now on
         """
-        self.waiting.remove(cell)
-        self.running[cell] = time.monotonic()
+        self.waiting.remove(run)
+        self.running[run] = time.monotonic()
 
-    def skip(self, cell: Cell) -> None:
+    def skip(self, run: GridRun) -> None:
         """
-        :param cell: Was done by another process
+        :param run: Was done by another process
         """
-        self.waiting.remove(cell)
+        self.waiting.remove(run)
         self.n_done += 1
 
-    def finish(self, cell: Cell, seconds: float) -> None:
+    def finish(self, run: GridRun, seconds: float) -> None:
         """
-        :param cell: Came to its end
+        :param run: Came to its end
         :param seconds: That it took
         """
-        del self.running[cell]
+        del self.running[run]
         self.n_done += 1
-        self._believed += self._rates.seconds(cell)
+        self._believed += self._rates.seconds(run)
         self._real += seconds
         total = self.n_done + len(self.running) + len(self.waiting) + len(self.failures)
         left = f", {duration(self.time_left())} left" if self.running or self.waiting else ""
         self.console.print(
-            f"{self.n_done} of {total}: {cell.name} done in {duration(seconds)}{left}", soft_wrap=True, highlight=False
+            f"{self.n_done} of {total}: {run.name} done in {duration(seconds)}{left}", soft_wrap=True, highlight=False
         )
 
     def fail(self, failure: Failure, again: bool) -> None:
@@ -105,9 +105,9 @@ class GridView:
         :param failure: Of a run
         :param again: Whether it is tried again
         """
-        del self.running[failure.cell]
+        del self.running[failure.run]
         if again:
-            self.waiting.insert(0, failure.cell)
+            self.waiting.insert(0, failure.run)
         else:
             self.failures.append(failure)
         words = f"{failure}{' (tried again)' * again}"
@@ -121,8 +121,8 @@ class GridView:
         factor = self._real / self._believed if self._believed else 1.0
         now = time.monotonic()
         # Copies, for the view is drawn by a thread of its own
-        running = [max(factor * self._rates.seconds(cell) - (now - start), 0.0) for cell, start in list(self.running.items())]
-        waiting = [factor * self._rates.seconds(cell) for cell in list(self.waiting)]
+        running = [max(factor * self._rates.seconds(run) - (now - start), 0.0) for run, start in list(self.running.items())]
+        waiting = [factor * self._rates.seconds(run) for run in list(self.waiting)]
         # The longest of those running is the least that it can be
         return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
 
@@ -138,8 +138,8 @@ class GridView:
         )
         now = time.monotonic()
         running = Table.grid(padding=(0, 2))
-        for cell, start in list(self.running.items())[:20]:
-            running.add_row("", cell.name, duration(now - start))
+        for run, start in list(self.running.items())[:20]:
+            running.add_row("", run.name, duration(now - start))
         if len(self.running) > 20:
             running.add_row("", f"and {len(self.running) - 20} more", "")
         failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]

@@ -18,7 +18,7 @@ from pathlib import Path
 import gymnasium as gym
 from rich.console import Console
 
-from benchmarks.grid import BUDGETS, Cell, Rates, cells
+from benchmarks.grid import BUDGETS, GridRun, Rates, grid_runs
 from benchmarks.grid_view import duration
 from benchmarks.results import METHODS, read_result, read_results
 from benchmarks.runs import PACKAGES
@@ -58,11 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     console = Console()
     try:
-        grid = cells(list(SUITES) if args.suite == "all" else [args.suite], args.env, args.method, args.seeds, args.budget)
+        grid = grid_runs(list(SUITES) if args.suite == "all" else [args.suite], args.env, args.method, args.seeds, args.budget)
         if args.dry_run:
             list_grid(grid, args.results, console)
             return 0
-        if all(cell.result(args.results) for cell in grid):
+        if all(run.result(args.results) for run in grid):
             console.print(f"All {len(grid)} runs are done. Results: {args.results}")
             note_versions(grid, args.results, console)
             return 0
@@ -87,23 +87,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failures else 0
 
 
-def list_grid(grid: Sequence[Cell], results: Path, console: Console) -> None:
+def list_grid(grid: Sequence[GridRun], results: Path, console: Console) -> None:
     """
-    :param grid: Cells
+    :param grid: Runs of the grid
     :param results: Folder of all results
     :param console: Where they are listed
     """
     rates = Rates(read_results(results))
     counts: Counter[str] = Counter()
     left = 0.0
-    width = max(len(cell.name) for cell in grid)
-    for cell in grid:
-        done = cell.result(results)
+    width = max(len(run.name) for run in grid)
+    for run in grid:
+        done = run.result(results)
         counts["done" if done else "left"] += 1
-        left += 0.0 if done else rates.seconds(cell)
-        status = f"done in {duration(done.seconds)}" if done else f"{duration(rates.seconds(cell))}"
-        steps = f"{cell.n_tasks} x {cell.steps_per_task:,}".replace(",", " ")
-        console.print(f"{cell.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
+        left += 0.0 if done else rates.seconds(run)
+        status = f"done in {duration(done.seconds)}" if done else f"{duration(rates.seconds(run))}"
+        steps = f"{run.n_tasks} x {run.steps_per_task:,}".replace(",", " ")
+        console.print(f"{run.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
     console.print(
         f"{len(grid)} runs, {counts['done']} of them done. The other {counts['left']} take {duration(left)} on a core, "
         f"by the rates of the results in {results}, and where there are none by those of benchmarks/grid.py.",
@@ -126,32 +126,32 @@ def check_writable(folder: Path) -> None:
         raise ValueError(f"--results must be a folder that can be written to; got {folder}: {error}") from error
 
 
-def note_replaced(grid: Sequence[Cell], results: Path, console: Console) -> None:
+def note_replaced(grid: Sequence[GridRun], results: Path, console: Console) -> None:
     """
     Say which results are of other hyperparameters or lengths than the runs that will take their place.
 
-    :param grid: Cells
+    :param grid: Runs of the grid
     :param results: Folder of all results
     :param console: Where to
     """
-    for cell in grid:
-        if cell.result(results) is None and (other := read_result(cell.path(results))) is not None:
-            names = ", ".join(name for name, value in cell.settings.items() if other.settings[name] != value)
+    for run in grid:
+        if run.result(results) is None and (other := read_result(run.path(results))) is not None:
+            names = ", ".join(name for name, value in run.settings.items() if other.settings[name] != value)
             console.print(f"{other.path} is of other {names}, and will be replaced.", soft_wrap=True, highlight=False)
 
 
-def note_versions(grid: Sequence[Cell], results: Path, console: Console) -> None:
+def note_versions(grid: Sequence[GridRun], results: Path, console: Console) -> None:
     """
     Say which results were made with other versions than are installed: they count as done.
 
-    :param grid: Cells
+    :param grid: Runs of the grid
     :param results: Folder of all results
     :param console: Where to
     """
     installed = {name: version(name) for name in PACKAGES}
     made_with: Counter[str] = Counter()
-    for cell in grid:
-        if result := cell.result(results):
+    for run in grid:
+        if result := run.result(results):
             made_with[", ".join(f"{name} {result.versions[name]}" for name in PACKAGES)] += 1
     for versions, n_results in made_with.items():
         if versions != ", ".join(f"{name} {installed[name]}" for name in PACKAGES):

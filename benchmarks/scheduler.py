@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from benchmarks.grid import Cell, Rates
+from benchmarks.grid import GridRun, Rates
 from benchmarks.grid_view import Failure, GridView
 from benchmarks.results import METRIC_PREFIXES, Result, in_json, read_results, write_result
 from benchmarks.runs import PACKAGES, peak_memory, shipped_hyperparameters
@@ -53,7 +53,7 @@ class Finished(NamedTuple):
     metrics: list[dict[str, Any]]
 
 
-def train(cell: Cell, logs: Path, device: str = "cpu", git_commit: str | None = None) -> Finished:
+def train(grid_run: GridRun, logs: Path, device: str = "cpu", git_commit: str | None = None) -> Finished:
     """
     Train in a process of its own, with one thread, to the end.
 
@@ -61,7 +61,7 @@ def train(cell: Cell, logs: Path, device: str = "cpu", git_commit: str | None = 
     begins a task anew when it has lost sight of a machine, which need not have died. A process whose parent died dies, too, on
     Linux (``benchmarks/child.py``); that saves its core for the next attempt, but nothing rests on it.
 
-    :param cell: What
+    :param grid_run: What
     :param logs: Folder of all logs
     :param device: PyTorch device
     :param git_commit: To be written down
@@ -69,8 +69,8 @@ def train(cell: Cell, logs: Path, device: str = "cpu", git_commit: str | None = 
     :raises RunFailed: When the process fails
     """
     started = datetime.now(timezone.utc)
-    attempt = cell.path(logs) / f"attempt_{started:%Y%m%dT%H%M%S}_{uuid.uuid4().hex[:8]}"
-    run = cell.run(attempt, device)
+    attempt = grid_run.path(logs) / f"attempt_{started:%Y%m%dT%H%M%S}_{uuid.uuid4().hex[:8]}"
+    run = grid_run.run(attempt, device)
     memory = None
     clock = time.monotonic()
     process = run.start()
@@ -86,28 +86,28 @@ def train(cell: Cell, logs: Path, device: str = "cpu", git_commit: str | None = 
         raise RunFailed(_reason(log, process.returncode), str(log), platform.node())
     result = Result(
         path=Path(),
-        suite=cell.suite,
-        env_id=cell.env_id,
-        method=cell.method,
-        algo=cell.algo,
-        seed=cell.seed,
-        budget=cell.budget,
-        n_tasks=cell.n_tasks,
-        steps_per_task=cell.steps_per_task,
-        task_names=list(cell.task_names),
-        task_boundaries=[cell.steps_per_task * (task + 1) for task in range(cell.n_tasks)],
-        hyperparameters=in_json(shipped_hyperparameters(cell.algo, cell.env_id)),
+        suite=grid_run.suite,
+        env_id=grid_run.env_id,
+        method=grid_run.method,
+        algo=grid_run.algo,
+        seed=grid_run.seed,
+        budget=grid_run.budget,
+        n_tasks=grid_run.n_tasks,
+        steps_per_task=grid_run.steps_per_task,
+        task_names=list(grid_run.task_names),
+        task_boundaries=[grid_run.steps_per_task * (task + 1) for task in range(grid_run.n_tasks)],
+        hyperparameters=in_json(shipped_hyperparameters(grid_run.algo, grid_run.env_id)),
         # In the folder that a user would choose, not in the attempt's
-        command=["sb3-cchain", *cell.run(cell.path(Path("logs/grid")), device).arguments],
+        command=["sb3-cchain", *grid_run.run(grid_run.path(Path("logs/grid")), device).arguments],
         versions={**{name: version(name) for name in (*PACKAGES, "numpy")}, "python": platform.python_version()},
         git_commit=git_commit,
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         seconds=round(seconds, 1),
-        steps_per_second=round(cell.total_steps / seconds, 1),
+        steps_per_second=round(grid_run.total_steps / seconds, 1),
         peak_memory=memory,
     )
-    return Finished(result, SUITES[cell.suite].returns(run), run.scalars(METRIC_PREFIXES))
+    return Finished(result, SUITES[grid_run.suite].returns(run), run.scalars(METRIC_PREFIXES))
 
 
 def _reason(log: Path, returncode: int) -> str:
@@ -186,55 +186,55 @@ def slots(resources: dict[str, float], gpus_per_run: float) -> int:
 
 
 def complete_grid(
-    ray: Any, cells: Sequence[Cell], results: Path, logs: Path, gpus_per_run: float = 0.0, console: Console | None = None
+    ray: Any, grid: Sequence[GridRun], results: Path, logs: Path, gpus_per_run: float = 0.0, console: Console | None = None
 ) -> list[Failure]:
     """
-    Bring all cells to their end. Those that have a result are left as they are, so the same call goes on after an
+    Bring all runs to their end. Those that have a result are left as they are, so the same call goes on after an
     interruption. The results come back here and are written here, whole and one by one, so machines need share no files.
 
     :param ray: The module, connected
-    :param cells: The cells, in the order in which they are to run
+    :param grid: The runs, in the order in which they are to run
     :param results: Folder of all results
     :param logs: Folder of all logs, on the machine that a run is on
     :param gpus_per_run: GPUs of a run; those that have one train on it
     :param console: Where the progress is shown
     :return: The runs that failed, after ``RETRIES`` further attempts each
     """
-    waiting = [cell for cell in cells if cell.result(results) is None]
-    view = GridView(waiting, len(cells) - len(waiting), Rates(read_results(results)), console or Console())
+    waiting = [run for run in grid if run.result(results) is None]
+    view = GridView(waiting, len(grid) - len(waiting), Rates(read_results(results)), console or Console())
     task = ray.remote(train).options(num_cpus=1, num_gpus=gpus_per_run, max_retries=0, scheduling_strategy="SPREAD")
     arguments = (logs.absolute(), "cuda" if gpus_per_run > 0 else "cpu", commit_of_checkout())
-    running: dict[Any, Cell] = {}
-    n_failures: Counter[Cell] = Counter()
+    running: dict[Any, GridRun] = {}
+    n_failures: Counter[GridRun] = Counter()
     with view.live:
         while view.waiting or running:
             # No more than can run, so that what another process has done meanwhile is seen
             view.slots = slots(ray.cluster_resources(), gpus_per_run)
             while view.waiting and len(running) < view.slots:
-                cell = view.waiting[0]
-                if cell.result(results) is not None:
-                    view.skip(cell)
+                run = view.waiting[0]
+                if run.result(results) is not None:
+                    view.skip(run)
                     continue
-                running[task.remote(cell, *arguments)] = cell
-                view.start(cell)
+                running[task.remote(run, *arguments)] = run
+                view.start(run)
             ready, _ = ray.wait(list(running), num_returns=len(running), timeout=1.0) if running else ([], [])
             for reference in ready:
-                cell = running.pop(reference)
+                run = running.pop(reference)
                 try:
                     finished = Finished(*ray.get(reference))
                 except ray.exceptions.RayError as error:
-                    n_failures[cell] += 1
-                    view.fail(_failure(cell, error, logs), again=n_failures[cell] <= RETRIES)
+                    n_failures[run] += 1
+                    view.fail(_failure(run, error, logs), again=n_failures[run] <= RETRIES)
                 else:
-                    result = replace(finished.result, path=cell.path(results))
+                    result = replace(finished.result, path=run.path(results))
                     write_result(result, finished.returns, finished.metrics)
-                    view.finish(cell, result.seconds)
+                    view.finish(run, result.seconds)
     return view.failures
 
 
-def _failure(cell: Cell, error: Exception, logs: Path) -> Failure:
+def _failure(run: GridRun, error: Exception, logs: Path) -> Failure:
     """What a Ray error says of a run."""
     cause = getattr(error, "cause", None) or error
     if isinstance(cause, RunFailed):
-        return Failure(cell, *cause.args)
-    return Failure(cell, f"{type(cause).__name__}: {' '.join(str(cause).split())}"[:200], str(cell.path(logs)))
+        return Failure(run, *cause.args)
+    return Failure(run, f"{type(cause).__name__}: {' '.join(str(cause).split())}"[:200], str(run.path(logs)))

@@ -1,4 +1,4 @@
-"""The grid of the paper: its cells, their results, and that neither is lost or made twice when something dies."""
+"""The grid of the paper: its runs, their results, and that neither is lost or made twice when something dies."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks.grid import Cell, Rates, cells, length
+from benchmarks.grid import GridRun, Rates, grid_runs, length
 from benchmarks.grid_view import Failure, GridView, duration
 from benchmarks.results import METHODS, Result, in_json, read_result, read_results, write_result
 from benchmarks.run import main
@@ -23,21 +23,21 @@ from benchmarks.scheduler import RETRIES, ROOT, RunFailed, complete_grid, connec
 from benchmarks.suites import SUITES
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
-CELL = Cell("gym_control", "Continual/CartPole-v1", "cchain", 0, "smoke", 2, 800, ("task 0", "task 1"))
+GRID_RUN = GridRun("gym_control", "Continual/CartPole-v1", "cchain", 0, "smoke", 2, 800, ("task 0", "task 1"))
 ROWS = [
     {"timesteps": 800, "task_id": 0, "n_episodes": 4, "mean_return": 20.0},
     {"timesteps": 1600, "task_id": 0, "n_episodes": 2, "mean_return": 30.0},
 ]
 
 
-def make_result(folder, cell=CELL, seconds=10.0, steps_per_second=160.0, **settings):
+def make_result(folder, run=GRID_RUN, seconds=10.0, steps_per_second=160.0, **settings):
     """As of a finished run."""
     return Result(
-        path=cell.path(folder),
-        suite=cell.suite,
-        method=cell.method,
-        budget=cell.budget,
-        task_names=list(cell.task_names),
+        path=run.path(folder),
+        suite=run.suite,
+        method=run.method,
+        budget=run.budget,
+        task_names=list(run.task_names),
         task_boundaries=[800, 1600],
         command=["sb3-cchain", "train"],
         versions={"sb3-cchain": "0", "stable-baselines3": "0", "gymnasium": "0", "torch": "0", "numpy": "0", "python": "0"},
@@ -47,7 +47,7 @@ def make_result(folder, cell=CELL, seconds=10.0, steps_per_second=160.0, **setti
         seconds=seconds,
         steps_per_second=steps_per_second,
         peak_memory=None,
-        **{**cell.settings, **settings},
+        **{**run.settings, **settings},
     )
 
 
@@ -79,7 +79,7 @@ def test_a_result_is_whole_or_not_there(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             write_result(result, ROWS, [])
     # What it left is no result, and in nobody's way
-    assert len(list(result.path.parent.iterdir())) == 1 and read_results(tmp_path) == [] and CELL.result(tmp_path) is None
+    assert len(list(result.path.parent.iterdir())) == 1 and read_results(tmp_path) == [] and GRID_RUN.result(tmp_path) is None
     write_result(result, ROWS, [])
     assert read_results(tmp_path) == [result]
 
@@ -108,15 +108,15 @@ def test_writers_at_once_leave_one_whole_result(tmp_path, same):
 def test_a_result_counts_under_its_settings_alone(tmp_path):
     result = make_result(tmp_path)
     write_result(result, ROWS, [])
-    assert CELL.result(tmp_path) == result
+    assert GRID_RUN.result(tmp_path) == result
     for change in (dict(seed=1), dict(method="vanilla"), dict(budget="paper"), dict(n_tasks=3), dict(steps_per_task=801)):
-        assert replace(CELL, **change).result(tmp_path) is None
-    hyperparameters = {**CELL.settings["hyperparameters"], "learning_rate": 1.0}
+        assert replace(GRID_RUN, **change).result(tmp_path) is None
+    hyperparameters = {**GRID_RUN.settings["hyperparameters"], "learning_rate": 1.0}
     write_result(make_result(tmp_path, hyperparameters=hyperparameters), ROWS, [])
-    assert CELL.result(tmp_path) is None
+    assert GRID_RUN.result(tmp_path) is None
 
 
-# --- Cells --------------------------------------------------------------------------------------------------------------
+# --- The grid -----------------------------------------------------------------------------------------------------------
 
 
 def test_methods():
@@ -132,21 +132,23 @@ def test_methods():
     assert SUITES["minatar"].methods == {"oracle": "double_dqn_oracle", "vanilla": "double_dqn", "cchain": "dqn_cchain"}
 
 
-def test_cells_of_gym_control():
-    grid = cells(["gym_control"], budget="reduced")
+def test_the_grid_of_gym_control():
+    grid = grid_runs(["gym_control"], budget="reduced")
     assert len(grid) == len(set(grid)) == 4 * 6 * 3
-    assert [cell.seed for cell in grid] == [0] * 24 + [1] * 24 + [2] * 24
+    assert [run.seed for run in grid] == [0] * 24 + [1] * 24 + [2] * 24
     # A suite in 6 hours on two cores
     assert sum(map(Rates([]).seconds, grid)) < 2 * 6 * 3600
-    grid = cells(["gym_control"], ["Continual/MountainCar-v0", "Continual/CartPole-v1"], ["cchain", "vanilla", "cchain"], 2)
-    assert [(cell.seed, cell.method, cell.env_id, cell.n_tasks, cell.steps_per_task) for cell in grid] == [
+    grid = grid_runs(
+        ["gym_control"], ["Continual/MountainCar-v0", "Continual/CartPole-v1"], ["cchain", "vanilla", "cchain"], 2
+    )
+    assert [(run.seed, run.method, run.env_id, run.n_tasks, run.steps_per_task) for run in grid] == [
         (seed, method, *env)
         for seed in (0, 1)
         for method in ("cchain", "vanilla")
         for env in (("Continual/CartPole-v1", 10, 160_000), ("Continual/MountainCar-v0", 5, 320_000))
     ]
     assert grid[0].task_names == tuple(f"task {i}" for i in range(10))
-    assert len(cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
+    assert len(grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
 
 
 def test_lengths():
@@ -158,22 +160,22 @@ def test_lengths():
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
-def test_cells_of_all_suites():
-    grid = cells(list(SUITES), budget="paper")
-    counts = {suite: sum(cell.suite == suite for cell in grid) for suite in SUITES}
+def test_the_grid_of_all_suites():
+    grid = grid_runs(list(SUITES), budget="paper")
+    counts = {suite: sum(run.suite == suite for run in grid) for suite in SUITES}
     assert counts == dict(gym_control=4 * 6 * 6, procgen=16 * 9 * 6, dmc=3 * 3 * 12, minatar=1 * 3 * 12)
-    assert {cell.env_id for cell in grid} == {f"Continual/{name}" for name in CONTINUAL_ENVS}
-    assert all(cell.settings["hyperparameters"] for cell in grid)
-    names = {cell.env_id: cell.task_names for cell in grid}
+    assert {run.env_id for run in grid} == {f"Continual/{name}" for name in CONTINUAL_ENVS}
+    assert all(run.settings["hyperparameters"] for run in grid)
+    names = {run.env_id: run.task_names for run in grid}
     assert names["Continual/Maze-v0"] == ("level 20", "level 21", "level 22", "level 23", "level 24")
     assert names["Continual/Dog-v0"] == ("stand", "walk", "run", "trot")
 
 
-def test_a_cell_is_the_command_that_a_user_would_type(tmp_path):
-    run = CELL.run(tmp_path)
+def test_a_grid_run_is_the_command_that_a_user_would_type(tmp_path):
+    run = GRID_RUN.run(tmp_path)
     assert run == Run("ppo_cchain", "Continual/CartPole-v1", 0, 2, 800, tmp_path, ("n_tasks:2", "offset_seed:0"))
     assert "--hyperparams" not in run.arguments
-    evaluated = Cell("minatar", "Continual/MinAtar-v0", "vanilla", 3, "reduced", 3, 150_000, ())
+    evaluated = GridRun("minatar", "Continual/MinAtar-v0", "vanilla", 3, "reduced", 3, 150_000, ())
     assert evaluated.run(tmp_path).eval_freq == 5000
     assert evaluated.run(tmp_path, "cuda").arguments[9:13] == ["--num-threads", "1", "--device", "cuda"]
 
@@ -219,12 +221,12 @@ def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, c
 
 
 def test_a_damaged_result_is_named(tmp_path, capsys):
-    CELL.path(tmp_path).mkdir(parents=True)
+    GRID_RUN.path(tmp_path).mkdir(parents=True)
     for text in ("", "{}"):
-        (CELL.path(tmp_path) / "run.json").write_text(text)
+        (GRID_RUN.path(tmp_path) / "run.json").write_text(text)
         with pytest.raises(SystemExit):
             main(["--suite", "gym_control", "--budget", "smoke", "--dry-run", "--results", str(tmp_path)])
-        assert f"{CELL.path(tmp_path) / 'run.json'} is not a result" in capsys.readouterr().err
+        assert f"{GRID_RUN.path(tmp_path) / 'run.json'} is not a result" in capsys.readouterr().err
 
 
 def test_results_that_will_be_replaced_are_told(tmp_path, capsys):
@@ -246,7 +248,7 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
     assert lines[2].startswith("2 runs, 1 of them done. The other 1 take 4 s on a core")
     assert lines[3].startswith("1 of the results are of sb3-cchain 0")
     # Nothing to do needs no Ray
-    write_result(make_result(tmp_path, replace(CELL, method="vanilla")), ROWS, [])
+    write_result(make_result(tmp_path, replace(GRID_RUN, method="vanilla")), ROWS, [])
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("All 2 runs are done.")
 
@@ -255,18 +257,18 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
 
 
 def test_rates_by_hand(tmp_path):
-    acrobot = replace(CELL, env_id="Continual/Acrobot-v1", budget="reduced")
-    paper = replace(CELL, budget="paper", n_tasks=1, steps_per_task=1000)
+    acrobot = replace(GRID_RUN, env_id="Continual/Acrobot-v1", budget="reduced")
+    paper = replace(GRID_RUN, budget="paper", n_tasks=1, steps_per_task=1000)
     # Nothing known: 430 steps per second, 500 of Vanilla
     assert Rates([]).seconds(paper) == pytest.approx(1000 / 430)
     assert Rates([]).seconds(replace(paper, method="weight_clipping")) == pytest.approx(2.0)
-    results = [make_result(tmp_path, CELL, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
+    results = [make_result(tmp_path, GRID_RUN, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
     results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
     # Of the suite, 3200 steps in 64 seconds, not of smoke runs, though of the same environment
     assert Rates(results).seconds(paper) == pytest.approx(20.0)
-    results.append(make_result(tmp_path, replace(CELL, budget="reduced"), seconds=16.0))
+    results.append(make_result(tmp_path, replace(GRID_RUN, budget="reduced"), seconds=16.0))
     assert Rates(results).seconds(paper) == pytest.approx(10.0)
-    assert Rates(results).seconds(CELL) == pytest.approx(1000.0)
+    assert Rates(results).seconds(GRID_RUN) == pytest.approx(1000.0)
 
 
 def test_durations():
@@ -278,7 +280,7 @@ def test_durations():
 def test_time_left_by_hand(monkeypatch):
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    some = [replace(CELL, seed=seed, steps_per_task=4300) for seed in range(5)]  # 20 seconds each at 430 steps per second
+    some = [replace(GRID_RUN, seed=seed, steps_per_task=4300) for seed in range(5)]  # 20 seconds each at 430 steps per second
     console = Console(record=True, width=200)
     view = GridView(some, n_done=3, rates=Rates([]), console=console)
     view.slots = 2
@@ -320,18 +322,18 @@ def test_slots_by_hand():
     assert slots({}, 0.0) == 1
 
 
-# --- Runs ---------------------------------------------------------------------------------------------------------------
+# --- Training -----------------------------------------------------------------------------------------------------------
 
 
 def train_smoke(suite, env_id, method, folder):
-    (cell,) = cells([suite], [env_id], [method], budget="smoke")
-    finished = train(cell, folder / "logs", git_commit="abc")
-    write_result(replace(finished.result, path=cell.path(folder / "results")), finished.returns, finished.metrics)
-    result = cell.result(folder / "results")
+    (run,) = grid_runs([suite], [env_id], [method], budget="smoke")
+    finished = train(run, folder / "logs", git_commit="abc")
+    write_result(replace(finished.result, path=run.path(folder / "results")), finished.returns, finished.metrics)
+    result = run.result(folder / "results")
     assert result is not None and result.seconds > 0 and result.git_commit == "abc" and result.started < result.finished
-    assert result.steps_per_second == pytest.approx(cell.total_steps / result.seconds, rel=0.01)
+    assert result.steps_per_second == pytest.approx(run.total_steps / result.seconds, rel=0.01)
     assert str(folder) not in (result.path / "run.json").read_text()
-    assert result.task_boundaries == [cell.steps_per_task, 2 * cell.steps_per_task]
+    assert result.task_boundaries == [run.steps_per_task, 2 * run.steps_per_task]
     return result
 
 
@@ -367,7 +369,7 @@ def test_runs_of_the_other_suites(suite, env_id, method, names, tmp_path):
 
 
 def test_a_failed_run_says_why(tmp_path):
-    bad = replace(CELL, env_id="Continual/Acrobat-v1")
+    bad = replace(GRID_RUN, env_id="Continual/Acrobat-v1")
     with pytest.raises(RunFailed) as error:
         train(bad, tmp_path)
     reason, log, _ = error.value.args
@@ -415,8 +417,8 @@ def test_which_runs_are_begun(tmp_path):
     Of four seeds, the first comes to its end at the third attempt, the second never; another process finishes the third, which
     waits meanwhile; the fourth was done before.
     """
-    grid = [replace(CELL, seed=seed) for seed in range(4)]
-    made = [make_result(tmp_path, cell) for cell in grid]
+    grid = [replace(GRID_RUN, seed=seed) for seed in range(4)]
+    made = [make_result(tmp_path, run) for run in grid]
     write_result(made[3], ROWS, [])
 
     def error():
@@ -430,7 +432,7 @@ def test_which_runs_are_begun(tmp_path):
     output = Console(record=True, file=open(os.devnull, "w"), width=300)
     failures = complete_grid(ray, grid, tmp_path, tmp_path / "logs", 0.25, output)
     assert read_results(tmp_path) == [made[0], made[2], made[3]]
-    assert [(failure.cell.seed, failure.reason) for failure in failures] == [(1, "RayError: line 1 line 2")]
+    assert [(failure.run.seed, failure.reason) for failure in failures] == [(1, "RayError: line 1 line 2")]
     assert sorted(arguments[0].seed for arguments in ray.calls) == [0, 0, 0, 1, 1, 1]
     assert {arguments[2] for arguments in ray.calls} == {"cuda"}
     shown = output.export_text()
@@ -465,8 +467,8 @@ def wait_for(condition, what, seconds=900):  # Ray gives its workers the lowest 
     return value
 
 
-def attempts(cell, logs):
-    return {path.name for path in cell.path(logs).glob("attempt_*")}
+def attempts(run, logs):
+    return {path.name for path in run.path(logs).glob("attempt_*")}
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
@@ -480,7 +482,7 @@ def test_a_killed_grid_goes_on(tmp_path):
     command = [sys.executable, "-m", "benchmarks.run", "--suite", "gym_control", "--env", "Continual/CartPole-v1"]
     command += ["--method", "vanilla", "--seeds", "4", "--budget", "smoke", "--cpus", "2"]
     command += ["--results", str(results), "--logs", str(logs)]
-    grid = cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 4, "smoke")
+    grid = grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 4, "smoke")
     with open(tmp_path / "first.txt", "w") as output:
         driver = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
     try:
@@ -492,23 +494,23 @@ def test_a_killed_grid_goes_on(tmp_path):
         driver.kill()
         driver.wait()
     wait_for(lambda: not trainings(logs), "end of the killed grid", 60)
-    before = {cell: (cell.path(results) / "run.json").stat().st_mtime_ns for cell in grid if cell.result(results)}
-    tried = {cell: attempts(cell, logs) for cell in grid}
+    before = {run: (run.path(results) / "run.json").stat().st_mtime_ns for run in grid if run.result(results)}
+    tried = {run: attempts(run, logs) for run in grid}
     assert 1 <= len(before) < 4
 
     again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
     assert again.returncode == 0, again.stdout + again.stderr
     assert "4 of 4 runs are done, 0 failed" in again.stdout
     assert sorted(result.seed for result in read_results(results)) == [0, 1, 2, 3]
-    for cell in grid:
-        assert len(read_result(cell.path(results)).returns) == 2
-        if cell in before:  # not again
-            assert (cell.path(results) / "run.json").stat().st_mtime_ns == before[cell]
-            assert attempts(cell, logs) == tried[cell]
+    for run in grid:
+        assert len(read_result(run.path(results)).returns) == 2
+        if run in before:  # not again
+            assert (run.path(results) / "run.json").stat().st_mtime_ns == before[run]
+            assert attempts(run, logs) == tried[run]
         else:
-            assert len(attempts(cell, logs) - tried[cell]) == 1
+            assert len(attempts(run, logs) - tried[run]) == 1
     # The run whose worker was killed
-    assert sum(len(attempts(cell, logs)) for cell in grid) >= 4 + 1
+    assert sum(len(attempts(run, logs)) for run in grid) >= 4 + 1
 
 
 @linux
@@ -518,8 +520,8 @@ def test_a_cluster_of_two_nodes_loses_one(tmp_path):
     from ray.cluster_utils import Cluster
 
     results, logs = tmp_path / "results", tmp_path / "logs"
-    grid = cells(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 3, "smoke")
-    bad = replace(CELL, env_id="Continual/Acrobat-v1")
+    grid = grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 3, "smoke")
+    bad = replace(GRID_RUN, env_id="Continual/Acrobat-v1")
     ray = import_ray()
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     raylets = set()
@@ -544,7 +546,7 @@ def test_a_cluster_of_two_nodes_loses_one(tmp_path):
         cluster.shutdown()
     assert len(raylets) == 2
     assert [result.seed for result in read_results(results)] == [0, 1, 2]
-    assert sum(len(attempts(cell, logs)) for cell in grid) == 3 + 1
+    assert sum(len(attempts(run, logs)) for run in grid) == 3 + 1
     (failure,) = failures
-    assert failure.cell == bad and "Acrobot-v1" in failure.reason and Path(failure.log).exists()
+    assert failure.run == bad and "Acrobot-v1" in failure.reason and Path(failure.log).exists()
     assert len(attempts(bad, logs)) == 1 + RETRIES
