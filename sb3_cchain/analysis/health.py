@@ -18,6 +18,7 @@ from sb3_cchain.analysis.rank import effective_rank, singular_values, srank
 from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
 from sb3_cchain.common.forward_hooks import forward_hooks
 from sb3_cchain.common.model_optimizers import model_optimizers
+from sb3_cchain.common.policy_inputs import empty_memory, n_observations
 
 
 def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 0.025) -> dict[str, float]:
@@ -184,8 +185,6 @@ def _act(policy: Any, observations: PyTorchObs) -> Any:
     """All that an actor-critic policy computes in one pass, with its values; of others, what their actions take."""
     if not hasattr(policy, "lstm_actor"):
         return policy(observations, deterministic=True)
-    n_observations = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
-    n_layers, _, size = policy.lstm_hidden_state_shape
-    empty = th.zeros(n_layers, n_observations, size, device=policy.device)
-    memory = SimpleNamespace(pi=(empty, empty), vf=(empty, empty))
-    return policy(observations, memory, th.ones(n_observations, device=policy.device), deterministic=True)
+    memory = empty_memory(policy, observations)
+    episode_starts = th.ones(n_observations(observations), device=policy.device)
+    return policy(observations, SimpleNamespace(pi=memory, vf=memory), episode_starts, deterministic=True)

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
+from sb3_cchain.common.policy_inputs import empty_memory, n_observations
 from sb3_cchain.common.policy_outputs import distribution_outputs, policy_outputs, policy_values
 from sb3_cchain.common.reference_batch import Batch
 
@@ -73,10 +74,8 @@ def _of_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
 
 def _of_recurrent_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
     observations = batch["observations"]
-    batch_size = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
-    n_layers, _, hidden_size = policy.lstm_hidden_state_shape
-    zeros = th.zeros(n_layers, batch_size, hidden_size, device=policy.device)
-    at_the_start = (zeros, zeros), th.zeros(batch_size, device=policy.device)
+    episode_starts = th.zeros(n_observations(observations), device=policy.device)
+    at_the_start = empty_memory(policy, observations), episode_starts
     distribution, _ = policy.get_distribution(observations, *at_the_start)
     return _with_actions(policy, distribution_outputs(distribution), policy.predict_values(observations, *at_the_start))
 

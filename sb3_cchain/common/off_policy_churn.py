@@ -9,6 +9,7 @@ from stable_baselines3 import DQN
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient, mean_squared_difference
 from sb3_cchain.churn.reducer import Observations
+from sb3_cchain.common.policy_inputs import n_observations
 from sb3_cchain.common.policy_outputs import as_it_acts, has_training_mode
 from sb3_cchain.common.replaced import replaced
 
@@ -134,5 +135,5 @@ def _cat(minibatch: Observations, reference: Observations) -> Observations:
 
 
 def _split(outputs: th.Tensor, minibatch: Observations) -> tuple[th.Tensor, th.Tensor]:
-    size = len(next(iter(minibatch.values())) if isinstance(minibatch, dict) else minibatch)
+    size = n_observations(minibatch)
     return outputs[:size], outputs[size:]

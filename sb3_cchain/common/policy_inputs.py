@@ -1,0 +1,25 @@
+"""What the networks of any policy get: a batch of observations and, where they are recurrent, a memory."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+
+def n_observations(observations: PyTorchObs) -> int:
+    """
+    :param observations: Batch of observations, of a ``Dict`` space a dict of tensors
+    :return: How many there are
+    """
+    return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+
+
+def empty_memory(policy: Any, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+    """
+    :param policy: A recurrent policy of sb3-contrib
+    :param observations: Batch of observations
+    :return: Hidden state and cell state of its LSTM, were each of them an episode's first
+    """
+    n_layers, _, size = policy.lstm_hidden_state_shape
+    zeros = th.zeros(n_layers, n_observations(observations), size, device=policy.device)
+    return zeros, zeros
