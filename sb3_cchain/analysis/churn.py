@@ -3,7 +3,7 @@
 import torch as th
 
 from sb3_cchain.analysis.model_outputs import ModelOutputs
-from sb3_cchain.churn.divergence import cross_entropy, mean_squared_difference
+from sb3_cchain.churn.divergence import action_changes, cross_entropy, mean_absolute_change, mean_squared_difference
 
 
 def kl_divergence(old: th.Tensor, new: th.Tensor) -> float:
@@ -19,24 +19,6 @@ def kl_divergence(old: th.Tensor, new: th.Tensor) -> float:
     # In single precision the probabilities miss a sum of 1 by more than what one small update changes
     old, new = (probs.double() / probs.double().sum(dim=-1, keepdim=True) for probs in (old, new))
     return (cross_entropy(old, new) - cross_entropy(old, old)).item()
-
-
-def mean_absolute_change(old: th.Tensor, new: th.Tensor) -> float:
-    """
-    :param old: Values before, of any shape
-    :param new: Values after, of the same shape
-    :return: Mean over all elements of the absolute difference
-    """
-    return (new - old).abs().mean().item()
-
-
-def action_changes(old: th.Tensor, new: th.Tensor) -> float:
-    """
-    :param old: Actions before, ``(batch_size,)`` or ``(batch_size, n_sub_actions)``
-    :param new: Actions after, of the same shape
-    :return: Share of the states in which the action, or any of its sub-actions, is another one
-    """
-    return (old != new).reshape(len(old), -1).any(dim=1).double().mean().item()
 
 
 def churn(old: ModelOutputs, new: ModelOutputs) -> dict[str, float]:

@@ -1,7 +1,8 @@
 """
 How far a network's outputs moved: pure functions of the outputs before (``old``) and after (``new``) an update.
 
-Each returns a scalar, the mean over the batch. ``old`` is a constant: no gradient flows into it.
+A divergence, which a loss is made of, returns a scalar tensor, the mean over the batch. ``old`` is a constant: no gradient
+flows into it. The others return numbers to log.
 """
 
 from collections.abc import Callable
@@ -39,3 +40,21 @@ def mean_squared_difference(old: th.Tensor, new: th.Tensor) -> th.Tensor:
     :return: Mean over all elements
     """
     return F.mse_loss(new, old)
+
+
+def mean_absolute_change(old: th.Tensor, new: th.Tensor) -> float:
+    """
+    :param old: Values before, of any shape
+    :param new: Values after, of the same shape
+    :return: Mean over all elements of the absolute difference
+    """
+    return (new - old).abs().mean().item()
+
+
+def action_changes(old: th.Tensor, new: th.Tensor) -> float:
+    """
+    :param old: Actions before, ``(batch_size,)`` or ``(batch_size, n_sub_actions)``
+    :param new: Actions after, of the same shape
+    :return: Share of the states in which the action, or any of its sub-actions, is another one
+    """
+    return (old != new).reshape(len(old), -1).any(dim=1).sum().item() / len(old)

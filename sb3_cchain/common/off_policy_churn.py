@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3 import DQN
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient, mean_squared_difference
+from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.common.policy_inputs import n_observations
 from sb3_cchain.common.policy_outputs import as_it_acts, has_training_mode
@@ -69,12 +70,11 @@ def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Itera
         base_loss = float(model.logger.name_to_value["train/loss"])
         churn_loss = sum(reducer.losses) / len(reducer.losses)
         old, new = (th.cat(outputs) for outputs in zip(*reducer.compared, strict=True))
-        greedy_action_changes = (old.argmax(dim=1) != new.argmax(dim=1)).float().mean()
         model.logger.record_mean("churn/loss", churn_loss)
         model.logger.record_mean("churn/coef", coef)
         model.logger.record_mean("churn/relative_loss", coef * churn_loss / (base_loss + 1e-8))
-        model.logger.record_mean("churn/value_churn", (new - old).abs().mean().item())
-        model.logger.record_mean("churn/greedy_action_changes", greedy_action_changes.item())
+        model.logger.record_mean("churn/value_churn", mean_absolute_change(old, new))
+        model.logger.record_mean("churn/greedy_action_changes", action_changes(old.argmax(dim=1), new.argmax(dim=1)))
         reducer.end_iteration(base_loss)
 
 

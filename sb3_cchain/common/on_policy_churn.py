@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, component_backward, extra_gradient
 from sb3_cchain.churn.component import COMPONENTS
+from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.common.policy_outputs import (
     DEFAULT_TARGET_RATIO,
     as_it_acts,
@@ -131,7 +132,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
         with acting():
             if old_values is not None:
                 assert reducer.reference is not None
-                value_churns.append((policy_values(policy, reducer.reference) - old_values).abs().mean().item())
+                value_churns.append(mean_absolute_change(old_values, policy_values(policy, reducer.reference)))
             reducer.backward(references.current, add_gradient)
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
