@@ -10,6 +10,19 @@ NUMBERED_MINIBATCHES = (
     "minibatches = list(self.rollout_buffer.get(self.batch_size))\nfor position, rollout_data in enumerate(minibatches):",
 )
 
+# Under which PPO's loop and ours are compared, and the coefficient of the churn loss
+PPO_SETTINGS = dict(
+    n_steps=64,
+    batch_size=16,
+    n_epochs=4,
+    learning_rate=3e-3,
+    ent_coef=0.01,
+    policy_kwargs=dict(net_arch=[16]),
+    seed=0,
+    device="cpu",
+)
+COEF = 30.0
+
 
 def rewritten(method, *replacements):
     """``method`` with each original replaced, further lines at its indentation; fails when SB3 has changed one of them."""

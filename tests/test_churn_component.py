@@ -7,19 +7,7 @@ from stable_baselines3 import PPO
 from sb3_cchain import CChainCallback, CChainPPO
 from sb3_cchain.churn import component_backward, cross_entropy, gradient_component
 from sb3_cchain.common.policy_outputs import policy_outputs
-from tests.sb3_source import NUMBERED_MINIBATCHES, rewritten
-
-SETTINGS = dict(
-    n_steps=64,
-    batch_size=16,
-    n_epochs=4,
-    learning_rate=3e-3,
-    ent_coef=0.01,
-    policy_kwargs=dict(net_arch=[16]),
-    seed=0,
-    device="cpu",
-)
-COEF = 30.0
+from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
 
 
 def test_components_by_hand():
@@ -115,7 +103,7 @@ class WrittenOutPPO(PPO):
 @pytest.mark.parametrize("component", ["projection", "orthogonal"])
 @pytest.mark.parametrize("max_grad_norm", [0.5, 0.05])
 def test_equals_sb3_source_with_the_component_written_out(component, max_grad_norm):
-    settings = dict(SETTINGS, max_grad_norm=max_grad_norm)
+    settings = dict(PPO_SETTINGS, max_grad_norm=max_grad_norm)
     written_out = WrittenOutPPO("MlpPolicy", "CartPole-v1", **settings)
     written_out.component = component
     written_out.learn(64 * 2)
@@ -140,7 +128,7 @@ class GradientRecorder(CChainPPO):
 
 @pytest.mark.parametrize("env_id, policy", [("CartPole-v1", "MlpPolicy"), ("Pendulum-v1", "MlpPolicy")])
 def test_the_parts_sum_to_the_whole(env_id, policy):
-    settings = dict(SETTINGS, max_grad_norm=1e9)
+    settings = dict(PPO_SETTINGS, max_grad_norm=1e9)
 
     def second_gradient(**kwargs):
         return GradientRecorder(policy, env_id, **kwargs, **settings).learn(64).gradients[1]
@@ -158,13 +146,13 @@ def test_the_parts_sum_to_the_whole(env_id, policy):
 
 @pytest.mark.parametrize("component", ["projection", "orthogonal"])
 def test_save_load_and_the_callback_form(component, tmp_path):
-    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_component=component, **SETTINGS).learn(128)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_component=component, **PPO_SETTINGS).learn(128)
     model.save(tmp_path / "model")
     loaded = CChainPPO.load(tmp_path / "model", env=model.get_env(), device="cpu")
     assert loaded.churn_component == component
     loaded.learn(64)
 
-    stock = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(128, callback=CChainCallback(churn_component=component))
+    stock = PPO("MlpPolicy", "CartPole-v1", **PPO_SETTINGS).learn(128, callback=CChainCallback(churn_component=component))
     for name, parameter in stock.policy.named_parameters():
         assert th.equal(parameter, model.policy.get_parameter(name)), name
     assert not stock.policy.action_net.weight._backward_hooks  # nothing stays behind
@@ -186,7 +174,7 @@ def test_small_gradients_are_projected_too():
 @pytest.mark.parametrize("component", ["full", "projection", "orthogonal"])
 @pytest.mark.parametrize("n_frozen", [1, 4])
 def test_frozen_layers(component, n_frozen):
-    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_coef=COEF, churn_component=component, **SETTINGS)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", churn_coef=COEF, churn_component=component, **PPO_SETTINGS)
     actor = [*model.policy.mlp_extractor.policy_net.parameters(), *model.policy.action_net.parameters()]
     before = [parameter.clone() for parameter in actor]
     for parameter in actor[:n_frozen]:

@@ -13,20 +13,9 @@ from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainPPO
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.common.policy_outputs import policy_outputs
-from tests.sb3_source import NUMBERED_MINIBATCHES, rewritten
+from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
 
 N_ITERATIONS = 8
-SETTINGS = dict(
-    n_steps=64,
-    batch_size=16,
-    n_epochs=4,
-    learning_rate=3e-3,
-    ent_coef=0.01,
-    policy_kwargs=dict(net_arch=[16]),
-    seed=0,
-    device="cpu",
-)
-COEF = 30.0
 
 
 class WrittenOutPPO(PPO):
@@ -65,7 +54,7 @@ class WrittenOutPPO(PPO):
 @pytest.mark.parametrize("max_grad_norm", [0.5, 0.05])
 @pytest.mark.parametrize("target_kl", [None, 0.0005])
 def test_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl):
-    settings = dict(SETTINGS, max_grad_norm=max_grad_norm, target_kl=target_kl)
+    settings = dict(PPO_SETTINGS, max_grad_norm=max_grad_norm, target_kl=target_kl)
     written_out = WrittenOutPPO("MlpPolicy", env_id, **settings).learn(64 * N_ITERATIONS)
     seam = CChainPPO("MlpPolicy", env_id, churn_coef=COEF, **settings).learn(64 * N_ITERATIONS)
     plain = PPO("MlpPolicy", env_id, **settings).learn(64 * N_ITERATIONS)
@@ -81,7 +70,7 @@ def test_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, targ
 
 @pytest.mark.parametrize("env_id, target_churn_ratio", [("CartPole-v1", 1e4), ("Pendulum-v1", 0.05)])
 def test_equals_a_loop_that_copies_the_network(env_id, target_churn_ratio):
-    arguments = dict(target_churn_ratio=target_churn_ratio, churn_warmup=2, churn_window=5, **SETTINGS)
+    arguments = dict(target_churn_ratio=target_churn_ratio, churn_warmup=2, churn_window=5, **PPO_SETTINGS)
     copying = DeepCopyPPO("MlpPolicy", env_id, **arguments).learn(64 * 13)
     seam = CChainPPO("MlpPolicy", env_id, **arguments).learn(64 * 13)
     assert seam.policy.optimizer.state_dict()["state"][0]["step"] == 13 * 16 >= 200
