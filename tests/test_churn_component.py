@@ -34,7 +34,7 @@ def test_a_component_that_there_is_not():
 
 @pytest.mark.parametrize("argument", ["churn_component", "churn_base_loss"])
 def test_a_choice_that_there_is_not_is_refused_on_loading(argument, tmp_path):
-    CChainPPO("MlpPolicy", "CartPole-v1", **SETTINGS).save(tmp_path / "model")
+    CChainPPO("MlpPolicy", "CartPole-v1", **PPO_SETTINGS).save(tmp_path / "model")
     with pytest.raises(ValueError, match=f"`{argument}` must be one of .*got 'none'"):
         CChainPPO.load(tmp_path / "model", **{argument: "none"})
 
