@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 
-from sb3_cchain.zoo import main
+from sb3_cchain.zoo.cli import main
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 

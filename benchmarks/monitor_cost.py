@@ -25,7 +25,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 from benchmarks.speed import settings_of
 from sb3_cchain import ChurnMonitor
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
-from sb3_cchain.common.policies import ImpalaPolicy
+from sb3_cchain.networks.impala_policy import ImpalaPolicy
 
 MONITORS: list[type[BaseCallback]] = [ChurnMonitor, NTKCallback, NetworkHealth]
 

@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
-from sb3_cchain.zoo import hyperparams_folder
+from sb3_cchain.zoo.cli import hyperparams_folder
 
 DONE = "done.json"
 # Whose versions determine a run

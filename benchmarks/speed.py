@@ -29,13 +29,10 @@ from benchmarks.deepcopy_dqn import DeepCopyDQN
 from benchmarks.deepcopy_ppo import DeepCopyPPO
 from benchmarks.runs import shipped_hyperparameters
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.baselines import (
+from sb3_cchain.methods import (
     TRAC,
     AdamRel,
-    CReLU,
-    CReLUPolicy,
     L2Init,
-    LayerNormPolicy,
     OptimizerMetrics,
     OptimizerWrapper,
     Oracle,
@@ -44,6 +41,7 @@ from sb3_cchain.baselines import (
     ShrinkAndPerturb,
     WeightClipping,
 )
+from sb3_cchain.networks import CReLU, CReLUPolicy, LayerNormPolicy
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
 NOT_THE_MODELS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}

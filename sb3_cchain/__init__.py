@@ -1,10 +1,11 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
+from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import ChurnMonitor
-from sb3_cchain.callbacks import ContinualMetrics, TaskSync, TensorBoardOverview
-from sb3_cchain.dqn_cchain import CChainDQN, DoubleDQN
+from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.envs import ContinualEnv, register_envs
-from sb3_cchain.ppo_cchain import CChainCallback, CChainPPO
+from sb3_cchain.tasks import TaskSync
+from sb3_cchain.tensorboard import TensorBoardOverview
 
 __version__ = "0.1.0"
 __all__ = [

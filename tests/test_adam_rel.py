@@ -10,8 +10,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.baselines import TRAC, AdamRel, WeightClipping
-from sb3_cchain.baselines.adam_rel import reset_step_count
+from sb3_cchain.methods import TRAC, AdamRel, WeightClipping
+from sb3_cchain.methods.adam_rel import reset_step_count
 from tests.envs import RandomEnv
 
 PPO_SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=2, seed=0, device="cpu")

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from sb3_contrib import QRDQN, TQC, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
-from sb3_cchain.analysis.churn import action_changes, churn, kl_divergence, mean_absolute_change
+from sb3_cchain.analysis.metrics.churn import action_changes, churn, kl_divergence, mean_absolute_change
 from sb3_cchain.analysis.model_outputs import ModelOutputs, evaluation_mode, model_outputs
 from tests.envs import RandomEnv
 

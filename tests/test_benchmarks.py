@@ -9,7 +9,7 @@ import pytest
 from benchmarks.curves import COLORS, LABELS, averages_of, cost_table, plot_curves, report, returns_table, smoothed
 from benchmarks.runs import DONE, Run, complete
 from benchmarks.suites import ALL_ENVS, SUITES, Task, look_at
-from sb3_cchain.zoo import METHODS
+from sb3_cchain.zoo.cli import METHODS
 
 FRAME = np.zeros((20, 30, 3), np.uint8)
 CSV = "timesteps,task_id,n_episodes,mean_return\n"

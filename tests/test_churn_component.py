@@ -6,7 +6,7 @@ from stable_baselines3 import PPO
 
 from sb3_cchain import CChainCallback, CChainPPO
 from sb3_cchain.churn import component_backward, cross_entropy, gradient_component
-from sb3_cchain.common.policy_outputs import policy_outputs
+from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
 
 

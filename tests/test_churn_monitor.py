@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor
-from sb3_cchain.common.model_optimizers import model_optimizers
+from sb3_cchain.networks.model_optimizers import model_optimizers
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-2, 2, (2,), np.float32)

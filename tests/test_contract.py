@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from benchmarks.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainPPO
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
-from sb3_cchain.common.policy_outputs import policy_outputs
+from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
 
 N_ITERATIONS = 8

@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from benchmarks.deepcopy_dqn import DeepCopyDQN
 from sb3_cchain import CChainDQN, DoubleDQN
-from sb3_cchain.common import off_policy_churn
+from sb3_cchain.algorithms import off_policy
 from tests.envs import RandomEnv
 from tests.sb3_source import rewritten
 
@@ -111,7 +111,7 @@ def test_c_chain_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max
     cchain = partial(CChainDQN, double_q=double_q, loss=loss, churn_coef=COEF)
     written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN)
     if own_pass:
-        monkeypatch.setattr(off_policy_churn, "has_training_mode", lambda policy: True)
+        monkeypatch.setattr(off_policy, "has_training_mode", lambda policy: True)
         reference = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
         ours = cchain("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
         assert_equal(ours, reference)

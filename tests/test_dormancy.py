@@ -2,7 +2,7 @@
 
 import torch as th
 
-from sb3_cchain.analysis.dormancy import dormant_scores, mean_activity
+from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 
 
 def test_activity_by_hand():

@@ -7,10 +7,10 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cchain.analysis.dormancy import mean_activity
-from sb3_cchain.baselines import CReLU
-from sb3_cchain.baselines.hidden_units import find_hidden_units, hidden_activity
-from sb3_cchain.common.torch_layers import ImpalaCNN, MinAtarCNN
+from sb3_cchain.analysis.metrics.dormancy import mean_activity
+from sb3_cchain.methods.hidden_units import find_hidden_units, hidden_activity
+from sb3_cchain.networks import CReLU
+from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 
 
 def find(network, *shape):

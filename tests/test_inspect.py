@@ -10,10 +10,10 @@ import torch as th
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-import sb3_cchain.zoo
+import sb3_cchain.zoo.cli
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import NetworkHealth
-from sb3_cchain.inspection import algorithm_of, inspect_model, report
+from sb3_cchain.analysis.inspection import algorithm_of, inspect_model, report
 
 OF_PPO = dict(n_steps=32, batch_size=16)
 OF_DQN = dict(learning_starts=10, buffer_size=100)
@@ -31,7 +31,7 @@ OF_ALL |= {"churn_monitor/fresh/value_churn", "churn_monitor/fresh/greedy_action
 
 def inspect(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", "inspect", *map(str, arguments)])
-    sb3_cchain.zoo.main()
+    sb3_cchain.zoo.cli.main()
 
 
 @pytest.mark.parametrize("algorithm", list(ALGORITHMS))
@@ -90,14 +90,14 @@ def test_task_of_a_continual_environment(algorithm, tmp_path, monkeypatch, capsy
     env = make_vec_env("Continual/CartPole-v1", env_kwargs=dict(n_tasks=3, steps_per_task=32))
     make(algorithm, env).learn(64).save(tmp_path / "model.zip")
     seen = []
-    original = sb3_cchain.zoo_inspect.inspect_model
+    original = sb3_cchain.zoo.inspect.inspect_model
 
     def spy(model, *args):
         inspection = original(model, *args)
         seen.append(model.env.get_attr("task_id")[0])
         return inspection
 
-    monkeypatch.setattr("sb3_cchain.zoo_inspect.inspect_model", spy)
+    monkeypatch.setattr("sb3_cchain.zoo.inspect.inspect_model", spy)
     arguments = (tmp_path / "model.zip", "--env", "Continual/CartPole-v1", "--output", tmp_path)
     kwargs = ("--env-kwargs", "n_tasks:3", "steps_per_task:50")
     inspect(monkeypatch, *arguments, *kwargs)
@@ -136,11 +136,11 @@ def test_model_of_rl_zoo(tmp_path, monkeypatch):
         "sb3-cchain train --algo ppo --env Continual/CartPole-v1 --device cpu --seed 0 --eval-freq -1".split()
         + f"-conf {settings} -f {tmp_path} --env-kwargs n_tasks:2".split(),
     )
-    sb3_cchain.zoo.main()
+    sb3_cchain.zoo.cli.main()
     seen = []
-    original = sb3_cchain.zoo_inspect.inspect_model
+    original = sb3_cchain.zoo.inspect.inspect_model
     monkeypatch.setattr(
-        "sb3_cchain.zoo_inspect.inspect_model", lambda m, *args: (seen.append((m.env, args[-1])), original(m, *args))[1]
+        "sb3_cchain.zoo.inspect.inspect_model", lambda m, *args: (seen.append((m.env, args[-1])), original(m, *args))[1]
     )
     path = tmp_path / "ppo" / "Continual-CartPole-v1_1" / "Continual-CartPole-v1.zip"
     inspect(monkeypatch, path, "--env", "Continual/CartPole-v1", "--output", tmp_path)

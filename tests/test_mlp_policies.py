@@ -9,11 +9,11 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO
-from sb3_cchain.baselines import CReLU, CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
-from sb3_cchain.common.policy_outputs import has_training_mode
-from sb3_cchain.common.torch_layers import MinAtarCNN
-from tests.baseline_models import OFF_POLICY, ON_POLICY
+from sb3_cchain.networks import CReLU, CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
+from sb3_cchain.networks.extractors import MinAtarCNN
+from sb3_cchain.networks.policy_outputs import has_training_mode
 from tests.envs import RandomEnv
+from tests.method_models import OFF_POLICY, ON_POLICY
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
 DICT = spaces.Dict({"a": spaces.Box(-1, 1, (2,), np.float32), "b": spaces.Discrete(3)})

@@ -16,10 +16,12 @@ from torch import nn
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.analysis import NetworkHealth
-from sb3_cchain.analysis.health import group_norms, network_health, remember_initial_parameters, trained_groups
-from sb3_cchain.baselines import CReLU, CReLUPolicy, L2Init, ReDo
-from tests.baseline_models import ALGORITHMS, go_on, make_model, make_random_env, parameters
+from sb3_cchain.analysis.health import network_health, remember_initial_parameters, trained_groups
+from sb3_cchain.analysis.metrics.norms import group_norms
+from sb3_cchain.methods import L2Init, ReDo
+from sb3_cchain.networks import CReLU, CReLUPolicy
 from tests.envs import RandomEnv
+from tests.method_models import ALGORITHMS, go_on, make_model, make_random_env, parameters
 
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
 FRAMES = spaces.Box(0, 255, (36, 36, 1), np.uint8)

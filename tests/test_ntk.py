@@ -14,8 +14,9 @@ from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO
 from sb3_cchain.analysis import NTKCallback
-from sb3_cchain.analysis.gradients import minibatch_gradients
-from sb3_cchain.analysis.ntk import diagonal_sum, gram_matrix, ntk_statistics, off_diagonal_sum, policy_ntk, q_ntk
+from sb3_cchain.analysis.metrics.gradients import minibatch_gradients
+from sb3_cchain.analysis.metrics.ntk import diagonal_sum, gram_matrix, ntk_statistics, off_diagonal_sum
+from sb3_cchain.analysis.ntk import policy_ntk, q_ntk
 from tests.envs import RandomEnv
 
 KEYS = ["condition_number", "diagonal_sum", "effective_rank", "off_diagonal_sum", "srank"]
@@ -192,7 +193,7 @@ def test_vectorised_and_one_by_one_are_equal(monkeypatch):
 
 def test_small_policies_are_vectorised(monkeypatch):
     model = rollout(make_ppo("discrete"))
-    monkeypatch.setattr("sb3_cchain.analysis.gradients._one_by_one", lambda *args: pytest.fail("not vectorised"))
+    monkeypatch.setattr("sb3_cchain.analysis.metrics.gradients._one_by_one", lambda *args: pytest.fail("not vectorised"))
     policy_ntk(model)
     model.policy.action_dist.distribution.sample()  # not one of vmap's tensors
 

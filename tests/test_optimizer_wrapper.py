@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_cchain.baselines import TRAC, L2Init, OptimizerWrapper, Parseval, WeightClipping
+from sb3_cchain.methods import TRAC, L2Init, OptimizerWrapper, Parseval, WeightClipping
 
 ADAM = dict(base_kwargs=dict(eps=1e-5))
 CLIPPED = dict(base_class=WeightClipping, base_kwargs=dict(clip_ratio=0.8, **ADAM))

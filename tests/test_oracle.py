@@ -9,11 +9,11 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain import CChainCallback, ContinualEnv, TaskSync
-from sb3_cchain.baselines import Oracle
-from sb3_cchain.baselines.fresh_policy import fresh_policy
-from sb3_cchain.common.policies import ImpalaPolicy
-from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, make_env, make_model, parameters
+from sb3_cchain.methods import Oracle
+from sb3_cchain.methods.fresh_policy import fresh_policy
+from sb3_cchain.networks.impala_policy import ImpalaPolicy
 from tests.envs import CountEnv, RandomEnv
+from tests.method_models import ALGORITHMS, STEPS_PER_TASK, make_env, make_model, parameters
 
 
 class Spy(BaseCallback):

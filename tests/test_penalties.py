@@ -6,7 +6,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from torch import nn
 
-from sb3_cchain.baselines import L2Init, Parseval
+from sb3_cchain.methods import L2Init, Parseval
 from tests.sb3_source import rewritten
 
 COEF = 0.3

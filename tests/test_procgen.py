@@ -19,10 +19,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_cchain import CChainPPO, TaskSync
-from sb3_cchain.callbacks.task_sync import is_continual
 from sb3_cchain.envs import ContinualProcgen, ContinualProcgenVecEnv, ProcgenGame
 from sb3_cchain.envs.procgen import DISTRIBUTION_MODES, GAMES
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from sb3_cchain.tasks.sync import is_continual
 
 # Of the whole module, as there are no wheels for Python 3.13
 procgen = pytest.importorskip("procgen")

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch as th
 
-from sb3_cchain.analysis.rank import condition_number, effective_rank, singular_values, srank
+from sb3_cchain.analysis.metrics.rank import condition_number, effective_rank, singular_values, srank
 
 
 def values(*numbers):

@@ -11,13 +11,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
 from sb3_cchain import CChainCallback
-from sb3_cchain.baselines import L2Init, LayerNormPolicy, ReDo, WeightClipping
-from sb3_cchain.baselines.hidden_units import find_hidden_units
-from sb3_cchain.baselines.redo import recycle_units
-from sb3_cchain.common.policies import ImpalaPolicy
-from sb3_cchain.common.torch_layers import MinAtarCNN
-from tests.baseline_models import ALGORITHMS, make_model, make_random_env, parameters
+from sb3_cchain.methods import L2Init, ReDo, WeightClipping
+from sb3_cchain.methods.hidden_units import find_hidden_units
+from sb3_cchain.methods.redo import recycle_units
+from sb3_cchain.networks import LayerNormPolicy
+from sb3_cchain.networks.extractors import MinAtarCNN
+from sb3_cchain.networks.impala_policy import ImpalaPolicy
 from tests.envs import RandomEnv
+from tests.method_models import ALGORITHMS, make_model, make_random_env, parameters
 
 IMAGES = spaces.Box(0, 255, (12, 12, 3), np.uint8)
 FRAMES = spaces.Box(0, 255, (36, 36, 1), np.uint8)

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainCallback, CChainPPO
-from sb3_cchain.common.policy_outputs import policy_outputs
+from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.envs import RandomEnv
 
 SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu")

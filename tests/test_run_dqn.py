@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
-from sb3_cchain.common import off_policy_churn
-from sb3_cchain.common.torch_layers import MinAtarCNN
+from sb3_cchain.algorithms import off_policy
+from sb3_cchain.networks.extractors import MinAtarCNN
 from tests.envs import CountEnv, RandomEnv
 
 SETTINGS = dict(learning_starts=20, buffer_size=200, batch_size=8, train_freq=1, learning_rate=1e-3, seed=0, device="cpu")
@@ -138,7 +138,7 @@ def other_settings(name):
 def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, monkeypatch):
     models = []
     for own_pass in (False, True):
-        monkeypatch.setattr(off_policy_churn, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
+        monkeypatch.setattr(off_policy, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
         models.append(learn(n_timesteps=80, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
     for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.allclose(p, q, rtol=0, atol=1e-5)

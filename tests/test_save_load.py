@@ -10,7 +10,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cchain import CChainPPO
-from sb3_cchain.common.policy_outputs import policy_outputs
+from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.envs import RandomEnv
 
 SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu", churn_warmup=2, churn_window=4)

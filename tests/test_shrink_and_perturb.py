@@ -6,10 +6,10 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.baselines import ShrinkAndPerturb
-from sb3_cchain.baselines import shrink_and_perturb as module
-from tests.baseline_models import ALGORITHMS, STEPS_PER_TASK, make_model, make_random_env, parameters
+from sb3_cchain.methods import ShrinkAndPerturb
+from sb3_cchain.methods import shrink_and_perturb as module
 from tests.envs import CountEnv, RandomEnv
+from tests.method_models import ALGORITHMS, STEPS_PER_TASK, make_model, make_random_env, parameters
 
 
 class Spy(BaseCallback):

@@ -21,9 +21,9 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.scalar.scalars_plugin import ScalarsPlugin
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualEnv, ContinualMetrics, TaskSync, TensorBoardOverview
-from sb3_cchain.baselines import ReDo
-from sb3_cchain.callbacks.tensorboard_hyperparameters import hyperparameters
-from sb3_cchain.callbacks.tensorboard_layout import LAYOUT, layout_of
+from sb3_cchain.methods import ReDo
+from sb3_cchain.tensorboard.hyperparameters import hyperparameters
+from sb3_cchain.tensorboard.layout import LAYOUT, layout_of
 from tests.envs import CountEnv, RandomEnv
 
 SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=2, seed=0, device="cpu", policy_kwargs=dict(net_arch=[8]))

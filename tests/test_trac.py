@@ -9,8 +9,8 @@ from torch import nn
 from trac_optimizer import start_trac
 from trac_optimizer.trac import erfi as erfi_of_package
 
-from sb3_cchain.baselines import TRAC
-from sb3_cchain.baselines.trac import erfi
+from sb3_cchain.methods import TRAC
+from sb3_cchain.methods.trac import erfi
 
 N_STEPS = 200
 BASES = [(th.optim.Adam, dict(eps=1e-5)), (th.optim.SGD, dict(momentum=0.9))]

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_cchain.baselines import WeightClipping
+from sb3_cchain.methods import WeightClipping
 
 
 def step(layers, clip_ratio, value=7.0):

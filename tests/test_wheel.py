@@ -32,7 +32,7 @@ def python(folder, *arguments):
 def test_trains_with_the_hyperparameters_inside_the_wheel(installed):
     assert python(installed, "-c", "import sb3_cchain; print(sb3_cchain.__file__)").startswith(str(installed))
     output = python(
-        *(installed, "-m", "sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1"),
+        *(installed, "-m", "sb3_cchain.zoo.cli", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1"),
         *("-n", "2000", "-f", "logs", "--device", "cpu", "--eval-freq", "-1"),
     )
     assert f"Loading hyperparameters from: {installed}/site/sb3_cchain/zoo_hyperparams/ppo_cchain.yml" in output

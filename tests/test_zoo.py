@@ -17,9 +17,9 @@ import yaml
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.save_util import load_from_pkl
 
-import sb3_cchain.baselines as baselines
-import sb3_cchain.zoo as zoo
-import sb3_cchain.zoo_search as zoo_search
+import sb3_cchain.methods as baselines
+import sb3_cchain.zoo.cli as zoo
+import sb3_cchain.zoo.search as zoo_search
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.envs import TaskVecNormalize
@@ -45,7 +45,7 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("zoo")
     for algo in ("ppo", "ppo_cchain"):
         run(
-            *("sb3_cchain.zoo", "train", "--algo", algo, "--env", "Continual/Acrobot-v1", "-n", "3200"),
+            *("sb3_cchain.zoo.cli", "train", "--algo", algo, "--env", "Continual/Acrobot-v1", "-n", "3200"),
             *("-f", "logs", "-tb", "tb", "--n-eval-envs", "2", *SHORT),
             cwd=folder,
         )
@@ -92,8 +92,8 @@ def spying_evaluate_policy(model, env, **kwargs):
     return result
 
 callbacks.evaluate_policy = spying_evaluate_policy
-import sb3_cchain.zoo
-sb3_cchain.zoo.main()
+import sb3_cchain.zoo.cli
+sb3_cchain.zoo.cli.main()
 """)
     for algo in ("ppo", "ppo_cchain"):
         arguments = ("train", "--algo", algo, "--env", "Continual/Acrobot-v1", "-n", "2400", "-f", "logs")
@@ -105,7 +105,7 @@ sb3_cchain.zoo.main()
 
 def test_enjoy(trained):
     output = run(
-        *("sb3_cchain.zoo", "enjoy", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-f", "logs", "-n", "801"),
+        *("sb3_cchain.zoo.cli", "enjoy", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-f", "logs", "-n", "801"),
         *("--no-render", "--device", "cpu", "--env-kwargs", "first_task:1"),
         cwd=trained,
     )
@@ -119,7 +119,7 @@ def test_enjoy(trained):
 def test_continue_training(trained):
     agent = "logs/ppo_cchain/Continual-Acrobot-v1_1/Continual-Acrobot-v1.zip"
     output = run(
-        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-n", "800"),
+        *("sb3_cchain.zoo.cli", "train", "--algo", "ppo_cchain", "--env", "Continual/Acrobot-v1", "-n", "800"),
         *("-f", "logs2", "-i", agent, *SHORT),
         cwd=trained,
     )
@@ -133,20 +133,43 @@ def test_plots(trained, tmp_path):
             shutil.copytree(
                 trained / "logs" / algo / "Continual-Acrobot-v1_1", tmp_path / "logs" / algo / f"Continual-Acrobot-v1_{number}"
             )
-    run("sb3_cchain.zoo", "plot_train", "-a", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "-w", "2", cwd=tmp_path)
     run(
-        *("sb3_cchain.zoo", "all_plots", "-a", "ppo", "ppo_cchain", "-e", "Continual-Acrobot", "-f", "logs", "--no-million"),
+        "sb3_cchain.zoo.cli",
+        "plot_train",
+        "-a",
+        "ppo_cchain",
+        "-e",
+        "Continual-Acrobot",
+        "-f",
+        "logs",
+        "-w",
+        "2",
+        cwd=tmp_path,
+    )
+    run(
+        *(
+            "sb3_cchain.zoo.cli",
+            "all_plots",
+            "-a",
+            "ppo",
+            "ppo_cchain",
+            "-e",
+            "Continual-Acrobot",
+            "-f",
+            "logs",
+            "--no-million",
+        ),
         *("-o", "results"),
         cwd=tmp_path,
     )
     arguments = ("-i", "results.pkl", "-l", "PPO", "C-CHAIN", "--skip-timesteps", "-b", "-o", "plot.png", "--format", "png")
-    run("sb3_cchain.zoo", "plot_from_file", *arguments, cwd=tmp_path)
+    run("sb3_cchain.zoo.cli", "plot_from_file", *arguments, cwd=tmp_path)
     assert (tmp_path / "plot.png").stat().st_size > 1000
 
 
 def test_optimize(tmp_path):
     run(
-        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-n", "400", "-optimize"),
+        *("sb3_cchain.zoo.cli", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-n", "400", "-optimize"),
         *("--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "-f", "logs", "--no-optim-plots", *SHORT),
         cwd=tmp_path,
     )
@@ -181,7 +204,7 @@ MINATAR = [
 
 
 def test_train_on_minatar_by_dqn_cchain(tmp_path):
-    run("sb3_cchain.zoo", "train", "--algo", "dqn_cchain", *MINATAR, "--save-replay-buffer", cwd=tmp_path)
+    run("sb3_cchain.zoo.cli", "train", "--algo", "dqn_cchain", *MINATAR, "--save-replay-buffer", cwd=tmp_path)
     folder = tmp_path / "logs" / "dqn_cchain" / "Continual-MinAtar-v0_1"
     model = CChainDQN.load(folder / "Continual-MinAtar-v0.zip", device="cpu")
     assert (model.loss, model.double_q, model.learning_rate(1), model.max_grad_norm) == ("mse", True, 3e-4, np.inf)
@@ -195,13 +218,13 @@ def test_train_on_minatar_by_dqn_cchain(tmp_path):
     assert list(np.load(folder / "evaluations.npz")["timesteps"]) == [100, 200, 300]
     arguments = ("enjoy", "--algo", "dqn_cchain", "--env", "Continual/MinAtar-v0", "-f", "logs", "-n", "600", "--no-render")
     assert re.search(
-        r"^Mean reward: \d", run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path), flags=re.MULTILINE
+        r"^Mean reward: \d", run("sb3_cchain.zoo.cli", *arguments, "--device", "cpu", cwd=tmp_path), flags=re.MULTILINE
     )
 
 
 def test_optimize_dqn_cchain(tmp_path):
     run(
-        *("sb3_cchain.zoo", "train", "--algo", "dqn_cchain", *MINATAR, "-optimize", "--n-trials", "2"),
+        *("sb3_cchain.zoo.cli", "train", "--algo", "dqn_cchain", *MINATAR, "-optimize", "--n-trials", "2"),
         *("--n-evaluations", "1", "--no-optim-plots"),
         cwd=tmp_path,
     )
@@ -224,7 +247,7 @@ def test_stock_rl_zoo_trains_dqn_on_minatar(tmp_path):
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="dm_control has no wheels")
 def test_train_on_walker_with_normalisation_that_restarts(tmp_path):
     run(
-        *("sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-n", "4096", "-f", "logs"),
+        *("sb3_cchain.zoo.cli", "train", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-n", "4096", "-f", "logs"),
         *("-tb", "tb", "--env-kwargs", "steps_per_task:3000", "--eval-freq", "2048", "--eval-episodes", "1"),
         *("--num-threads", "1", "--device", "cpu", "--seed", "1", "-params", "n_epochs:1"),
         cwd=tmp_path,
@@ -240,7 +263,7 @@ def test_train_on_walker_with_normalisation_that_restarts(tmp_path):
     assert model.churn_reducer.coefficient.target_ratio == 0.5
     assert [type(layer) for layer in model.policy.mlp_extractor.policy_net] == [th.nn.Linear, th.nn.ReLU] * 2
     arguments = ("enjoy", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-f", "logs", "-n", "1001", "--no-render")
-    output = run("sb3_cchain.zoo", *arguments, "--device", "cpu", "--env-kwargs", "first_task:1", cwd=tmp_path)
+    output = run("sb3_cchain.zoo.cli", *arguments, "--device", "cpu", "--env-kwargs", "first_task:1", cwd=tmp_path)
     assert "Loading running average" in output and re.search(r"^Mean reward: ", output, flags=re.MULTILINE)
 
 
@@ -378,13 +401,13 @@ def test_search_space_depends_on_the_actions():
 
 SUITES = {"gym_control": GYM_CONTROL, "procgen": PROCGEN, "dmc": DMC, "minatar": ["Continual/MinAtar-v0"]}
 ADAM = "optimizer_kwargs=dict(eps=1e-8, fused=True)"
-METRICS = ["sb3_cchain.baselines.OptimizerMetrics"]
-ORACLE = "sb3_cchain.baselines.Oracle"
-REDO = {"sb3_cchain.baselines.ReDo": {"tau": 0.025, "interval": 10, "batch_size": 256}}
+METRICS = ["sb3_cchain.methods.OptimizerMetrics"]
+ORACLE = "sb3_cchain.methods.Oracle"
+REDO = {"sb3_cchain.methods.ReDo": {"tau": 0.025, "interval": 10, "batch_size": 256}}
 
 
 def optimizer(name, arguments):
-    return f"optimizer_class=get_class_by_name('sb3_cchain.baselines.{name}'), optimizer_kwargs=dict({arguments})"
+    return f"optimizer_class=get_class_by_name('sb3_cchain.methods.{name}'), optimizer_kwargs=dict({arguments})"
 
 
 # The callbacks that are added, and what stands for Adam's arguments among those of the policy
@@ -406,7 +429,7 @@ DIFFERENCES = {
     ("ppo_l2_init", "procgen"): (METRICS, optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-5)")),
     ("ppo_layer_norm", "procgen"): ([], "features_extractor_kwargs=dict(layer_norm=True)"),
     ("ppo_redo", "procgen"): ([REDO], ""),
-    ("ppo_adam_rel", "procgen"): (["sb3_cchain.baselines.AdamRel"], ""),
+    ("ppo_adam_rel", "procgen"): (["sb3_cchain.methods.AdamRel"], ""),
     ("double_dqn_oracle", "minatar"): ([{ORACLE: {"reset_replay_buffer": True}}], ""),
 }
 
@@ -500,7 +523,7 @@ def test_a_method_by_either_command(tmp_path):
         "tb",
     )
     arguments += ("--eval-freq", "-1", "--num-threads", "1", "--device", "cpu", "--seed", "1", "-params", "n_epochs:1")
-    run("sb3_cchain.zoo", "train", "--algo", "ppo_trac", *arguments, cwd=tmp_path)
+    run("sb3_cchain.zoo.cli", "train", "--algo", "ppo_trac", *arguments, cwd=tmp_path)
     settings = str(ROOT / "zoo_hyperparams" / "ppo_trac.yml")
     run("rl_zoo3.train", "--algo", "ppo", "--gym-packages", "sb3_cchain", "-conf", settings, *arguments, cwd=tmp_path)
     ours, stock = (
@@ -514,7 +537,7 @@ def test_a_method_by_either_command(tmp_path):
         rows = read_returns(tmp_path / "tb" / "Continual-Acrobot-v1" / f"PPO_{number}" / "returns.csv")
         assert [(row["timesteps"], row["task_id"]) for row in rows] == [(800, 0), (1600, 1)]
     arguments = ("enjoy", "--algo", "ppo_trac", "--env", "Continual/Acrobot-v1", "-f", "logs", "-n", "401", "--no-render")
-    output = run("sb3_cchain.zoo", *arguments, "--device", "cpu", cwd=tmp_path)
+    output = run("sb3_cchain.zoo.cli", *arguments, "--device", "cpu", cwd=tmp_path)
     assert re.search(r"^Mean reward: -\d", output, flags=re.MULTILINE)
 
 
@@ -548,7 +571,7 @@ REDO_FILE = """
 Continual/CartPole-v1:
   callback:
     - sb3_cchain.TaskSync
-    - sb3_cchain.baselines.ReDo:
+    - sb3_cchain.methods.ReDo:
         batch_size: 16
   policy: MlpPolicy
   policy_kwargs: "dict(net_arch=[8], activation_fn=nn.ReLU)"
@@ -585,7 +608,7 @@ def test_optimize_keeps_all_else_of_the_settings(monkeypatch, tmp_path, method, 
 
 
 def test_optimize_needs_redo_among_the_callbacks():
-    with pytest.raises(ValueError, match=r"`callback` must have sb3_cchain.baselines.ReDo, got \['sb3_cchain.TaskSync'\]"):
+    with pytest.raises(ValueError, match=r"`callback` must have sb3_cchain.methods.ReDo, got \['sb3_cchain.TaskSync'\]"):
         zoo_search.with_arguments(["sb3_cchain.TaskSync"], zoo_search.REDO, {"tau": 0.1})
     assert zoo_search.with_arguments(zoo_search.REDO, zoo_search.REDO, {"tau": 0.1}) == [{zoo_search.REDO: {"tau": 0.1}}]
 

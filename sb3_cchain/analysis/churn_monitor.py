@@ -11,12 +11,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.churn import churn
+from sb3_cchain.analysis.metrics.churn import churn
 from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
-from sb3_cchain.callbacks.tensorboard_overview import add_overview
-from sb3_cchain.common.model_optimizers import model_optimizers
-from sb3_cchain.common.random_state import unchanged_random_state
-from sb3_cchain.common.reference_batch import map_batch, recent_observations, sample_batch
+from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.analysis.reference_batch import map_batch, recent_observations, sample_batch
+from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 
 

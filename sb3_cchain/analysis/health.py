@@ -1,7 +1,7 @@
 """How healthy the networks of a model are: its hidden units, features and parameters, by groups of layers."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,13 +12,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_cchain.analysis.dormancy import dormant_scores, mean_activity
+from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
+from sb3_cchain.analysis.metrics.norms import group_norms
+from sb3_cchain.analysis.metrics.rank import effective_rank, singular_values, srank
 from sb3_cchain.analysis.model_outputs import evaluation_mode
-from sb3_cchain.analysis.rank import effective_rank, singular_values, srank
-from sb3_cchain.common.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
-from sb3_cchain.common.forward_hooks import forward_hooks
-from sb3_cchain.common.model_optimizers import model_optimizers
-from sb3_cchain.common.policy_inputs import empty_memory, n_observations
+from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
+from sb3_cchain.networks.forward_hooks import forward_hooks
+from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
 
 
 def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 0.025) -> dict[str, float]:
@@ -31,11 +32,11 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
 
     Of the units behind each activation function on the way from the observations to the actions and values (a unit of a
     convolution being a filter, as long as its output is not flattened). Activation functions are modules of PyTorch's usual
-    kinds (``common/activations.py``); what a network computes by functions, such as ``torch.relu``, is not seen, nor is a
+    kinds (``networks/activations.py``); what a network computes by functions, such as ``torch.relu``, is not seen, nor is a
     network without any:
 
     - ``dormant_share``: share of the units whose score :math:`s_i = E_x|h_i(x)| / \frac{1}{H} \sum_k E_x|h_k(x)|` among the H
-      of their layer is at most τ (:func:`~sb3_cchain.analysis.dormancy.dormant_scores`; Sokar et al., ICML 2023,
+      of their layer is at most τ (:func:`~sb3_cchain.analysis.metrics.dormancy.dormant_scores`; Sokar et al., ICML 2023,
       https://arxiv.org/abs/2302.12902)
     - ``active_share``: share of the pairs of unit and observation (and position, for a convolution) for which
       :math:`h_i(x) > 0`; only for ReLU, ReLU6 and CReLU. Fraction of active units (FAU) in Ma et al. (ICLR 2024),
@@ -46,8 +47,9 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
     Of the features of a group, the outputs :math:`\Phi` of its last activation function, ``(n_observations, n_features)``,
     flattened where they have positions, neither centred nor normalised:
 
-    - ``feature_srank``: :func:`~sb3_cchain.analysis.rank.srank` of :math:`\Phi` with δ = 0.01 (Kumar et al., ICLR 2021)
-    - ``feature_effective_rank``: :func:`~sb3_cchain.analysis.rank.effective_rank` of :math:`\Phi`
+    - ``feature_srank``: :func:`~sb3_cchain.analysis.metrics.rank.srank` of :math:`\Phi` with δ = 0.01 (Kumar et al.,
+      ICLR 2021)
+    - ``feature_effective_rank``: :func:`~sb3_cchain.analysis.metrics.rank.effective_rank` of :math:`\Phi`
 
     Neither can exceed the number of observations. They are not a number where the features are not finite.
 
@@ -81,20 +83,6 @@ def trained_groups(model: BaseAlgorithm) -> dict[str, dict[str, nn.Parameter]]:
             is_layer = not any(model.policy.get_submodule(layer).children())
             groups.setdefault(_group(layer if is_layer else name), {})[name] = parameter
     return groups
-
-
-def group_norms(name: str, tensors: Mapping[str, Iterable[th.Tensor]]) -> dict[str, float]:
-    """
-    :param name: What it is the norm of
-    :param tensors: For each group, its tensors
-    :return: The L2 norm of all of them together under ``name``, that of each group under ``name/group``
-    """
-    squares = {
-        group: math.fsum(th.linalg.vector_norm(tensor.detach()).item() ** 2 for tensor in of_group)
-        for group, of_group in tensors.items()
-    }
-    norms = {f"{name}/{group}": math.sqrt(square) for group, square in squares.items()}
-    return {name: math.sqrt(math.fsum(squares.values())), **norms}
 
 
 def remember_initial_parameters(model: BaseAlgorithm) -> None:

@@ -10,9 +10,9 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_cchain.common.policy_inputs import empty_memory, n_observations
-from sb3_cchain.common.policy_outputs import distribution_outputs, policy_outputs, policy_values
-from sb3_cchain.common.reference_batch import Batch
+from sb3_cchain.analysis.reference_batch import Batch
+from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
+from sb3_cchain.networks.policy_outputs import distribution_outputs, policy_outputs, policy_values
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.health import group_norms, network_health, remember_initial_parameters, trained_groups
-from sb3_cchain.callbacks.training_interval import TrainingInterval
-from sb3_cchain.common.model_optimizers import model_optimizers
-from sb3_cchain.common.random_state import unchanged_random_state
+from sb3_cchain.analysis.health import network_health, remember_initial_parameters, trained_groups
+from sb3_cchain.analysis.metrics.norms import group_norms
+from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.analysis.training_interval import TrainingInterval
+from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.validation import check_number
 
 

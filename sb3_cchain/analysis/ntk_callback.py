@@ -12,9 +12,10 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.ntk import ntk_statistics, policy_ntk, q_ntk
-from sb3_cchain.callbacks.training_interval import TrainingInterval
-from sb3_cchain.common.random_state import unchanged_random_state
+from sb3_cchain.analysis.metrics.ntk import ntk_statistics
+from sb3_cchain.analysis.ntk import policy_ntk, q_ntk
+from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.validation import check_number
 
 
@@ -28,9 +29,9 @@ class NTKCallback(TrainingInterval):
     Logged, of the matrix :math:`N` of size m:
 
     - ``ntk/srank``: the least number of singular values that hold 1 − δ of their sum
-      (:func:`~sb3_cchain.analysis.rank.srank`), the paper's "approximate rank"
+      (:func:`~sb3_cchain.analysis.metrics.rank.srank`), the paper's "approximate rank"
     - ``ntk/effective_rank``: the exponential of the entropy of their shares of the sum
-      (:func:`~sb3_cchain.analysis.rank.effective_rank`)
+      (:func:`~sb3_cchain.analysis.metrics.rank.effective_rank`)
     - ``ntk/off_diagonal_sum``, ``ntk/diagonal_sum``: sums of :math:`|N(i, j)|` off and on the diagonal
     - ``ntk/condition_number``: greatest by least singular value
     - ``ntk/matrix``: a picture of the matrix, in TensorBoard; the same as a PNG file

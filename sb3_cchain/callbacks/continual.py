@@ -5,7 +5,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
-from sb3_cchain.callbacks.task_sync import TaskSync, is_continual, iterate_callbacks
+from sb3_cchain.tasks.sync import TaskSync, is_continual, iterate_callbacks
 
 
 def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> MaybeCallback:

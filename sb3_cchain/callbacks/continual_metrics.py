@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.callbacks.task_sync import require_continual
-from sb3_cchain.callbacks.tensorboard_overview import add_overview
+from sb3_cchain.tasks.sync import require_continual
+from sb3_cchain.tensorboard.overview import add_overview
 
 RETURNS_CSV = "returns.csv"
 COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")

@@ -3,7 +3,7 @@
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cchain.callbacks.task_sync import require_continual
+from sb3_cchain.tasks.sync import require_continual
 from sb3_cchain.validation import check_number
 
 

@@ -24,7 +24,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     and ``info["episode_return"]`` the return of the episode so far, before any wrapper touched the rewards.
 
     With several environments side by side steps are counted over all of them, so that they switch together:
-    :class:`~sb3_cchain.callbacks.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
+    :class:`~sb3_cchain.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
     ``n_envs``.
 
     :param tasks: Environment ids, or callables that make an environment; they must agree in their spaces. A callable is

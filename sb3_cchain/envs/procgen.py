@@ -258,7 +258,7 @@ class ContinualProcgenVecEnv(VecEnv):
     steps them all in one call, in threads of its own.
 
     They share one clock: the step at which they have together made a task's number of steps truncates all their episodes.
-    :class:`~sb3_cchain.callbacks.TaskSync` works with it as with others; ``set_task`` acts from the next ``reset()`` on.
+    :class:`~sb3_cchain.TaskSync` works with it as with others; ``set_task`` acts from the next ``reset()`` on.
 
     Episodes are not recorded: wrap it in ``VecMonitor`` for that, as ``Monitor`` is for single environments. Frames
     (``render_mode="rgb_array"``) are the observations.

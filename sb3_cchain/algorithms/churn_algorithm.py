@@ -1,0 +1,121 @@
+"""The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
+
+from sb3_cchain.callbacks.continual import with_continual_callbacks
+from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
+from sb3_cchain.tasks.sync import TaskSwitch
+from sb3_cchain.tensorboard.overview import add_overview
+
+
+class ChurnAlgorithm(BaseAlgorithm):
+    """
+    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` that is saved with the model, the callbacks for
+    continual environments and the overview in TensorBoard to an SB3 algorithm. A subclass builds the reducer in
+    ``_make_churn_reducer()`` and uses it in ``train()``.
+
+    :param args: Arguments of the base algorithm
+    :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
+        ``target_churn_ratio`` times the base loss, or ``"auto_10"`` to use 10 instead of 1 during the warm-up.
+        With 0 the algorithm is its base, to the bit.
+    :param target_churn_ratio: β, the size of λ·L_churn relative to the base loss. ``"auto"`` is a default for the kind of
+        the network's outputs.
+    :param churn_warmup: Calls of ``train()`` until λ adapts
+    :param churn_window: Calls of ``train()`` that the running means of both losses go over
+    :param churn_coef_min: Least value of λ once it adapts
+    :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the code
+        released with the paper. C-CHAIN does not need to be told of a switch, hence not by default.
+    :param kwargs: Keyword arguments of the base algorithm
+    :raises ValueError: Naming the churn argument that is out of its range
+    """
+
+    churn_reducer: ChurnReducer
+
+    def __init__(
+        self,
+        *args: Any,
+        churn_coef: float | str = "auto",
+        target_churn_ratio: float | str = "auto",
+        churn_warmup: int = 10,
+        churn_window: int = 50,
+        churn_coef_min: float = 0.0,
+        reset_churn_coef: bool = False,
+        **kwargs: Any,
+    ):
+        self.churn_coef = churn_coef
+        self.target_churn_ratio = target_churn_ratio
+        self.churn_warmup = churn_warmup
+        self.churn_window = churn_window
+        self.churn_coef_min = churn_coef_min
+        self.reset_churn_coef = reset_churn_coef
+        # Bad values shall fail before an environment is made
+        self._make_churn_coefficient(default_target_ratio=1.0)
+        self._task_switch = TaskSwitch()
+        super().__init__(*args, **kwargs)
+
+    def _make_churn_coefficient(self, default_target_ratio: float) -> ChurnCoefficient:
+        return make_coefficient(
+            self.churn_coef,
+            self.target_churn_ratio,
+            default_target_ratio,
+            warmup=self.churn_warmup,
+            window=self.churn_window,
+            minimum=self.churn_coef_min,
+        )
+
+    def _make_churn_reducer(self) -> ChurnReducer:
+        raise NotImplementedError()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()  # type: ignore[safe-super]
+        self.churn_reducer = self._make_churn_reducer()
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        add_overview(self)  # to the logger that was just made
+        return super()._init_callback(with_continual_callbacks(callback, self.env), progress_bar)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if self.reset_churn_coef and self._task_switch.happened(infos):
+            self.churn_reducer.coefficient.reset()
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, torch_variables = super()._get_torch_save_params()
+        return [*state_dicts, "churn_reducer"], torch_variables
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """
+        As in SB3. Parameters of the base algorithm, which have no churn history, are accepted too: churn reduction starts
+        over. When another kind of λ or another window was asked for on loading, λ starts over.
+
+        :param load_path_or_dict: Path of a saved model, or what ``get_parameters()`` returned
+        :param exact_match: Whether all parameters must be given
+        :param device: Device to load a saved model to
+        """
+        params: Any
+        if isinstance(load_path_or_dict, dict):
+            params = load_path_or_dict
+        else:
+            _, params, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
+        # Without a history of their own, the parameters are those of a network that has not churned yet
+        fresh = self._make_churn_reducer().state_dict()
+        state = params.get("churn_reducer", fresh)
+        if _shapes(state) != _shapes(fresh):
+            state = {**fresh, "_extra_state": state["_extra_state"]}
+        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)
+        self.churn_reducer.move_reference(self.device)
+
+
+def _shapes(state: dict[str, Any]) -> dict[str, th.Size]:
+    return {key: value.shape for key, value in state.items() if th.is_tensor(value)}

@@ -1,0 +1,93 @@
+"""PPO with churn reduction."""
+
+from typing import Any, TypeVar
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
+from sb3_cchain.churn import ChurnReducer
+
+SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
+
+
+class CChainPPO(ChurnAlgorithm, PPO):
+    """
+    Proximal Policy Optimization with Continual Churn Approximated Reduction (C-CHAIN).
+
+    Paper: https://arxiv.org/abs/2506.00592 (Tang et al., ICML 2025)
+
+    It is SB3's :class:`~stable_baselines3.PPO`, with all of its arguments, plus λ·L_churn in the loss of each update, where
+    L_churn is the change that the update before made to the policy's outputs on a reference batch: the cross-entropy for
+    discrete actions, the mean squared difference of the action means for continuous ones.
+
+    Deviations from the code released with the paper:
+
+    - the reference batch shares no sample with the minibatch whose update is measured, as the paper demands; the released
+      code draws both independently;
+    - the loss that λ is measured by is the mean over an iteration's updates; in DeepMind Control the released code takes that
+      of the last minibatch, which is greater in absolute value;
+    - the old outputs are computed before the update instead of by a copy of the network after it, with the same result.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param args: Further arguments of PPO
+    :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
+        ``target_churn_ratio`` times ``churn_base_loss``, or ``"auto_10"`` to use 10 instead of 1 during the warm-up.
+        With 0 it is PPO, to the bit.
+    :param target_churn_ratio: β, the size of λ·L_churn relative to that loss. ``"auto"`` is 1e4 for discrete actions
+        (the paper takes the best of 1e3, 1e4 and 1e5) and 0.05 for continuous ones (the paper: 0.05 or 0.5).
+    :param churn_warmup: Iterations (rollout and ``train()``) until λ adapts
+    :param churn_window: Iterations that the running means of both losses go over
+    :param churn_coef_min: Least value of λ once it adapts
+    :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the released
+        code. C-CHAIN does not need to be told of a switch, hence not by default.
+    :param churn_base_loss: ``"actor"``, the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
+        or ``"surrogate"``, the former alone, as in its ProcGen
+    :param churn_component: Which component of the churn gradient is used: ``"full"``, or, as the paper's ablation does
+        (Section 5.2), only its ``"projection"`` on PPO's gradient of the actor's parameters or the ``"orthogonal"`` rest.
+        The gradient is clipped after it was added.
+    :param kwargs: Further keyword arguments of PPO
+    :raises ValueError: Naming the churn argument that is out of its range
+    """
+
+    def __init__(self, *args: Any, churn_base_loss: str = "actor", churn_component: str = "full", **kwargs: Any):
+        check_choices(churn_base_loss, churn_component)
+        self.churn_base_loss = churn_base_loss
+        self.churn_component = churn_component
+        super().__init__(*args, **kwargs)
+
+    def _make_churn_reducer(self) -> ChurnReducer:
+        check_choices(self.churn_base_loss, self.churn_component)  # given to load(), they come by here alone
+        return make_policy_reducer(self, self._make_churn_coefficient)
+
+    def train(self) -> None:
+        """Update the policy with the current rollout, as PPO does, with churn reduction."""
+        if self.churn_reducer.coefficient.is_zero:
+            super().train()
+        else:
+            with reduced_churn(self, self.churn_reducer, self.churn_base_loss, self.churn_component):
+                super().train()
+
+    def learn(
+        self: SelfCChainPPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "CChainPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCChainPPO:
+        """
+        As PPO's. In a continual environment the callbacks that follow its tasks are added.
+
+        :param total_timesteps: Environment steps to train for
+        :param callback: Callback(s) called at every step
+        :param log_interval: Iterations between two logs
+        :param tb_log_name: Name of the run in TensorBoard
+        :param reset_num_timesteps: Whether to count environment steps from 0
+        :param progress_bar: Whether to show a progress bar
+        :return: The trained model
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

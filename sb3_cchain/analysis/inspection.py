@@ -1,0 +1,246 @@
+"""Churn, the neural tangent kernel and the health of the networks of a model, after the fact."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch as th
+from matplotlib import style
+from matplotlib.figure import Figure
+from rich.table import Table
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.dqn.policies import DQNPolicy
+
+from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
+from sb3_cchain.analysis.health import trained_groups
+from sb3_cchain.analysis.metrics.norms import group_norms
+from sb3_cchain.analysis.ntk_callback import draw_ntk
+from sb3_cchain.replaced import replaced
+from sb3_cchain.tasks import TaskSync
+from sb3_cchain.tasks.sync import is_continual
+from sb3_cchain.validation import check_number
+
+# What there is of each group of layers, by the name after "health/"
+OF_GROUPS = ("dormant_share", "active_share", "feature_srank", "feature_effective_rank", "weight_norm", "distance_from_init")
+
+# Iterations or episodes until the logger is emptied
+_NEVER = 10**9
+
+
+@dataclass
+class Inspection:
+    """
+    What was found.
+
+    :param name: Name of the model
+    :param figures: By name as in TensorBoard, and ``rollout/mean_return``, ``rollout/n_episodes``, ``rollout/n_steps``
+    :param ntk: The neural tangent kernel
+    :param parameters: A copy of the parameters of each group of layers, by name
+    """
+
+    name: str
+    figures: dict[str, float]
+    ntk: th.Tensor
+    parameters: dict[str, dict[str, th.Tensor]]
+
+
+def inspect_model(
+    model: BaseAlgorithm,
+    name: str = "model",
+    n_steps: int = 2048,
+    n_updates: int = 100,
+    callbacks: Sequence[BaseCallback] = (),
+) -> Inspection:
+    """
+    Rolls the model out and trains it a little, as its training would go on, and looks at it with
+    :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` and
+    :class:`~sb3_cchain.analysis.NetworkHealth`. The model is not what it was afterwards.
+
+    On-policy, that is one iteration. Off-policy, ``n_steps`` steps fill a replay buffer, which is not saved with a model, and
+    ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
+    moment when the model was saved; where the learning rate had come down to 0, there is no churn.
+
+    :param model: A PPO, A2C, DQN or one of sb3-contrib's that the monitors know, with an environment
+    :param name: What it is called in reports
+    :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
+    :param n_updates: Gradient updates, for off-policy algorithms
+    :param callbacks: Those that it was trained with, as far as training depends on them
+    :return: What was found
+    :raises ValueError: Naming the argument that is out of its range
+    """
+    check_number("n_steps", n_steps, 1, integer=True)
+    check_number("n_updates", n_updates, 1, integer=True)
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    if isinstance(model, OnPolicyAlgorithm):
+        n_steps = model.n_steps * model.n_envs
+    elif isinstance(model, OffPolicyAlgorithm):
+        model.learning_starts = 0
+        model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
+        model.gradient_steps = n_updates
+    # Of this rollout, and of all of it
+    model.ep_info_buffer, model._stats_window_size = None, n_steps
+    parameters = {
+        group: {name: parameter.detach().clone() for name, parameter in of_group.items()}
+        for group, of_group in trained_groups(model).items()
+    }
+    knows_its_start = hasattr(model, "initial_parameters")
+    ntk, health = NTKCallback(interval=1, picture_interval=0), NetworkHealth(interval=1)
+    # What it was trained with looks at itself no more
+    others = [callback for callback in callbacks if not isinstance(callback, (ChurnMonitor, NTKCallback, NetworkHealth))]
+    if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
+        others.insert(0, TaskSync())
+    # The schedules stay where they are, instead of going to their ends
+    with replaced(model, "_update_current_progress_remaining", lambda *_: None):
+        model.learn(
+            n_steps,
+            callback=[*others, ChurnMonitor(interval=1), ntk, health],
+            log_interval=_NEVER,
+            reset_num_timesteps=False,
+        )
+    figures = {
+        tag: float(value)
+        for tag, value in model.logger.name_to_value.items()
+        if tag.startswith(("ntk/", "health/", "churn_monitor/"))
+        and (knows_its_start or not tag.startswith("health/distance_from_init"))
+    }
+    figures.update({f"health/{name}": norm for name, norm in health.gradient_norms().items()})
+    episodes: Iterable[dict[str, float]] = model.ep_info_buffer or []
+    returns = [episode["r"] for episode in episodes]
+    figures["rollout/mean_return"] = float(np.mean(returns)) if returns else np.nan
+    figures["rollout/n_episodes"] = len(returns)
+    figures["rollout/n_steps"] = n_steps
+    return Inspection(name, figures, ntk.matrix, parameters)
+
+
+def algorithm_of(path: str | Path) -> type[BaseAlgorithm]:
+    """
+    :param path: A model that was saved by PPO, DQN or one of ours
+    :return: The algorithm's class, which SB3 does not save; told by what it saves
+    :raises ValueError: When it is of another algorithm
+    """
+    data, *_ = load_from_zip_file(path, device="cpu")
+    assert data is not None
+    policy_class = data["policy_class"]
+    if policy_class.__module__.startswith("sb3_contrib"):
+        pass  # RecurrentPPO's policy is an ActorCriticPolicy
+    elif issubclass(policy_class, DQNPolicy):
+        return CChainDQN if "churn_coef" in data else DoubleDQN if "double_q" in data else DQN
+    elif issubclass(policy_class, ActorCriticPolicy) and "clip_range" in data:
+        return CChainPPO if "churn_coef" in data else PPO
+    raise ValueError(f"{path} was saved by neither PPO nor DQN (its policy is a {policy_class.__name__}): give its --algo")
+
+
+def report(inspections: Sequence[Inspection]) -> list[Table]:
+    """
+    :param inspections: Of one model, or of two to compare
+    :return: Tables
+    """
+    tables = []
+    for title, prefix in (
+        ("Rollout", "rollout/"),
+        ("Churn of an update, on the rollout's data", "churn_monitor/fresh/"),
+        ("Neural tangent kernel", "ntk/"),
+        ("Networks", "health/"),
+    ):
+        tags = [tag for tag in _tags(inspections, prefix) if "/" not in tag.removeprefix(prefix)]
+        tables.append(_table(title, inspections, {_words(tag.removeprefix(prefix)): tag for tag in tags}))
+    tags = sorted((tag for tag in _tags(inspections, "health/") if tag.count("/") > 1), key=_group)
+    rows = {f"{_group(tag)}: {_words(tag.split('/')[1])}": tag for tag in tags}
+    tables.append(_table("Groups of layers", inspections, rows))
+    if len(inspections) == 2:
+        tables.append(_distances(*inspections))
+    return tables
+
+
+def _distances(a: Inspection, b: Inspection) -> Table:
+    table = Table("", "L2 distance", title=f"From {a.name}'s parameters to {b.name}'s", title_justify="left", min_width=60)
+    shapes_of_a, shapes_of_b = (
+        {group: [(name, p.shape) for name, p in of_group.items()] for group, of_group in inspection.parameters.items()}
+        for inspection in (a, b)
+    )
+    differences = {
+        group: [b.parameters[group][name] - parameter for name, parameter in of_group.items()]
+        for group, of_group in a.parameters.items()
+        if shapes_of_a[group] == shapes_of_b.get(group)
+    }
+    for name, distance in group_norms("together", differences).items():
+        table.add_row(name.removeprefix("together/"), f"{distance:.4g}" if differences else "")
+    for group in dict.fromkeys([*shapes_of_a, *shapes_of_b]):
+        if group not in differences:
+            table.add_row(group, "not of the same shape")
+    return table
+
+
+def _words(name: str) -> str:
+    return "gradient norm, clipped" if name == "gradient_norm" else name.replace("_", " ")
+
+
+def _group(tag: str) -> str:
+    return tag.split("/", 2)[2]
+
+
+def _tags(inspections: Sequence[Inspection], prefix: str) -> list[str]:
+    return [tag for tag in dict.fromkeys(t for i in inspections for t in i.figures) if tag.startswith(prefix)]
+
+
+def _table(title: str, inspections: Sequence[Inspection], rows: dict[str, str]) -> Table:
+    table = Table("", title=title, title_justify="left", min_width=60)
+    for inspection in inspections:
+        table.add_column(inspection.name, justify="right")
+    if len(inspections) == 2:
+        table.add_column("ratio", justify="right")
+    for name, tag in rows.items():
+        values = [inspection.figures.get(tag, np.nan) for inspection in inspections]
+        ratio = [f"{values[1] / values[0]:.3g}" if values[0] else ""] if len(values) == 2 else []
+        table.add_row(name, *(f"{value:.4g}" for value in values), *ratio)
+    return table
+
+
+def plot(inspections: Sequence[Inspection], path: Path) -> None:
+    """
+    Draw the NTKs, and what there is of each group of layers.
+
+    :param inspections: Of one model, or of two to compare
+    :param path: PNG file
+    """
+    groups = list(dict.fromkeys(_group(t) for t in _tags(inspections, "health/") if t.count("/") > 1))
+    bars = [name for name in OF_GROUPS if any(tag.startswith(f"health/{name}/") for tag in _tags(inspections, "health/"))]
+    with style.context("default"):  # RL Zoo's plots leave seaborn's behind
+        figure = _figure(inspections, groups, bars)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _figure(inspections: Sequence[Inspection], groups: list[str], bars: list[str]) -> Figure:
+    figure = Figure(figsize=(11, 4.4 + 0.3 * len(groups) * len(inspections) + 1.2), dpi=100, layout="constrained")
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.4, 1.2 + 0.3 * len(groups) * len(inspections)]).flat
+    for axes, inspection in zip(above.subplots(1, 2).flat, [*inspections, None][:2], strict=True):
+        if inspection is None:
+            axes.axis("off")
+            continue
+        srank = inspection.figures["ntk/srank"]
+        image = draw_ntk(axes, inspection.ntk, f"{inspection.name}: NTK, srank {srank:.0f}")
+        above.colorbar(image, ax=axes, extend="both", label="inner product of gradients")
+    for axes, name in zip(below.subplots(1, len(bars), sharey=True, squeeze=False).flat, bars, strict=True):
+        height = 0.8 / len(inspections)
+        for i, inspection in enumerate(inspections):
+            values = [inspection.figures.get(f"health/{name}/{group}", np.nan) for group in groups]
+            axes.barh(np.arange(len(groups)) + i * height, values, height, label=inspection.name)
+        axes.set_yticks(np.arange(len(groups)) + height * (len(inspections) - 1) / 2, groups)
+        axes.set_title(name.replace("_", " ").replace("feature ", "feature\n"), fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.margins(x=0.1)
+    axes.invert_yaxis()
+    if len(inspections) > 1:
+        below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure

@@ -1,0 +1,1 @@
+"""Measures of plasticity: pure functions of tensors."""

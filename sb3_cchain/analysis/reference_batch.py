@@ -1,0 +1,76 @@
+"""Data of the training under way, to look at a model on."""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cchain.replaced import replaced
+
+# "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
+Batch = dict[str, Any]
+
+
+def sample_batch(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: int) -> Batch:
+    """
+    Observations as the networks get them. On-policy they are of the rollout, drawn without repetition and so no more than
+    there are, with the action masks of MaskablePPO; to be called between a rollout's end and the next one's start. Off-policy
+    they are of the replay buffer, with the actions.
+
+    :param model: A model
+    :param batch_size: How many
+    :return: Tensors on the model's device
+    """
+    if isinstance(model, OffPolicyAlgorithm):
+        assert model.replay_buffer is not None
+        sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
+        return {"observations": sample.observations, "actions": sample.actions}
+    buffer: Any = model.rollout_buffer
+    indices = np.random.permutation(buffer.buffer_size * buffer.n_envs)[:batch_size]
+    # (n_steps, n_envs, ...) before train() begins, then flat
+    shapes, arrays = buffer.obs_shape, buffer.observations
+    if isinstance(arrays, dict):
+        observations: Any = {key: array.reshape(-1, *shapes[key])[indices] for key, array in arrays.items()}
+    else:
+        observations = arrays.reshape(-1, *shapes)[indices]
+    batch: Batch = {"observations": observations}
+    if hasattr(buffer, "action_masks"):
+        batch["action_masks"] = buffer.action_masks.reshape(-1, buffer.mask_dims)[indices]
+    return map_batch(partial(th.as_tensor, device=model.device), batch)
+
+
+def map_batch(function: Callable[[Any], Any], batch: Batch) -> Batch:
+    """
+    :param function: What to apply to each tensor or array
+    :param batch: A batch, of which the observations may be a dict
+    :return: The same with the results in their places
+    """
+    return {name: map_batch(function, value) if isinstance(value, dict) else function(value) for name, value in batch.items()}
+
+
+@contextmanager
+def recent_observations(env: VecEnv, size: int) -> Iterator[deque[np.ndarray]]:
+    """
+    For an algorithm that keeps no observations.
+
+    :param env: The training environment
+    :param size: How many to keep
+    :return: The last observations that it returned inside the ``with`` block
+    """
+    recent: deque[np.ndarray] = deque(maxlen=size)
+    step_wait = env.step_wait
+
+    def step_wait_and_keep() -> Any:
+        step = step_wait()
+        recent.extend(np.array(step[0]))
+        return step
+
+    with replaced(env, "step_wait", step_wait_and_keep):
+        yield recent

@@ -1,0 +1,68 @@
+"""Acting every so much training, on data of that training."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_cchain.analysis.reference_batch import sample_batch
+from sb3_cchain.tensorboard.overview import add_overview
+from sb3_cchain.validation import check_number
+
+
+class TrainingInterval(BaseCallback):
+    """
+    Base of callbacks that act every ``interval``, and look at data of the training then.
+
+    :param interval: Calls of ``train()`` for on-policy algorithms, gradient updates for off-policy ones; None for the
+        defaults
+    :param default_on_policy: Default for on-policy algorithms
+    :param default_off_policy: Default for off-policy algorithms
+    :raises ValueError: When the interval is not a positive integer
+    """
+
+    model: OnPolicyAlgorithm | OffPolicyAlgorithm
+
+    def __init__(self, interval: int | None, default_on_policy: int, default_off_policy: int):
+        super().__init__()
+        if interval is not None:
+            check_number("interval", interval, 1, integer=True)
+        self.interval = interval
+        self._defaults = default_on_policy, default_off_policy
+        # Not begun anew when `learn()` is called again
+        self._has_looked = False
+
+    def _on_training_start(self) -> None:
+        add_overview(self.model)
+        on_policy = isinstance(self.model, OnPolicyAlgorithm)
+        self._interval = self.interval or self._defaults[0 if on_policy else 1]
+        self._n_trained = self._count()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _count(self) -> int:
+        """Calls of ``train()``, with the one that is due at the end of a rollout; off-policy, the updates."""
+        if isinstance(self.model, OnPolicyAlgorithm):
+            return self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
+        return self.model._n_updates
+
+    def _is_due(self) -> bool:
+        """Whether a multiple of the interval was reached since the last call."""
+        before, self._n_trained = self._n_trained, self._count()
+        return self._n_trained // self._interval > before // self._interval
+
+    def _is_due_to_look(self) -> bool:
+        """At a rollout's end, for callbacks that log: as ``_is_due()``, and at the first one that the model learns from."""
+        if isinstance(self.model, OffPolicyAlgorithm) and self.model.num_timesteps <= self.model.learning_starts:
+            return False
+        is_first, self._has_looked = not self._has_looked, True
+        return self._is_due() or is_first
+
+    def _sample_observations(self, batch_size: int) -> PyTorchObs:
+        """
+        Observations as the networks get them: on-policy of the rollout, without repetition and so no more than there are;
+        off-policy of the replay buffer. To be called between a rollout's end and ``train()``, which empties the former.
+        """
+        observations: PyTorchObs = sample_batch(self.model, batch_size)["observations"]
+        return observations

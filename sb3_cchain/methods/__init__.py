@@ -1,0 +1,27 @@
+"""The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm."""
+
+from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
+from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.methods.oracle import Oracle
+from sb3_cchain.methods.parseval import Parseval
+from sb3_cchain.methods.penalty import Penalty
+from sb3_cchain.methods.redo import ReDo
+from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.trac import TRAC
+from sb3_cchain.methods.weight_clipping import WeightClipping
+
+__all__ = [
+    "TRAC",
+    "AdamRel",
+    "L2Init",
+    "OptimizerMetrics",
+    "OptimizerWrapper",
+    "Oracle",
+    "Parseval",
+    "Penalty",
+    "ReDo",
+    "ShrinkAndPerturb",
+    "WeightClipping",
+]

@@ -1,0 +1,147 @@
+"""Which weights lead into and out of each hidden unit of a network."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_cchain.analysis.metrics.dormancy import mean_activity
+from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU
+from sb3_cchain.networks.forward_hooks import forward_hooks
+
+
+@dataclass
+class HiddenUnits:
+    """
+    The units (filters, for a convolution) of a hidden layer all of whose outgoing weights are known.
+
+    Modules are named as in ``network.named_modules()``. A *source* says of each input channel of a module which unit of the
+    layer it is, or -1.
+
+    :param layer: The linear or convolutional layer
+    :param n_units: Number of units
+    :param outgoing: The layers that the units feed, with their sources
+    :param norms: The LayerNorms between, with the sources of their parameters
+    """
+
+    layer: str
+    n_units: int
+    outgoing: dict[str, th.Tensor]
+    norms: dict[str, th.Tensor]
+
+
+def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
+    """
+    Find the hidden layers by sending a tag of each unit through the network instead of its output: a number that is its own,
+    the same at all positions. Activations and LayerNorms let the tags pass; pooling, transposing, flattening and
+    concatenation keep them; so the inputs of the next layer show which unit each of them is, however channels were flattened.
+    A sum, as in a residual connection, is no tag any more; its gradient with respect to the tags tells whose it was.
+
+    A layer is left out when any of its units feeds something else than a known place in a linear or convolutional layer: where
+    it is added to a residual stream, has grouped convolutions or modules that are not known here behind it, or is an output.
+
+    :param network: The network, in evaluation mode
+    :param run: Calls it on a batch of one observation of zeros, which no tag can be mistaken for
+    :return: The layers, in the order of ``network.named_modules()``
+    """
+    names = {module: name for name, module in network.named_modules()}
+    layers = [module for module in names if _is_layer(module)]
+    sizes = [layer.weight.shape[0] for layer in layers]
+    # Above 1, the greatest number in an encoded observation of zeros; below 2, and so no sum of tags is another
+    tags = [
+        (1 + unit * 2.0**-22).to(layer.weight).requires_grad_()
+        for layer, unit in zip(layers, th.arange(1, sum(sizes) + 1).split(sizes), strict=True)
+    ]
+    tag_of = dict(zip(layers, tags, strict=True))
+    arrived: dict[nn.Module, th.Tensor] = {}
+
+    def send_tags(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> th.Tensor | None:
+        if module in tag_of:
+            arrived[module] = _channels_last(module, inputs[0])
+            tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
+            return tagged.clone()  # for activations that write into what they are given
+        if isinstance(module, CReLU):
+            return th.cat([inputs[0], inputs[0]], dim=1)
+        if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
+            arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
+        return inputs[0] if isinstance(module, (*ELEMENTWISE_ACTIVATIONS, nn.Dropout, nn.LayerNorm)) else None
+
+    with forward_hooks(names, send_tags), th.enable_grad():
+        run()
+
+    all_tags = th.cat(tags).detach()
+    sources = {module: _read(all_tags, tagged) for module, tagged in arrived.items()}
+    elsewhere = th.zeros(len(all_tags), dtype=th.bool, device=all_tags.device)
+    for module in layers:
+        if module in arrived and arrived[module].requires_grad:
+            elsewhere |= _feeds_more(arrived[module], sources[module], tags)
+
+    found, first = [], 0
+    for layer, size in zip(layers, sizes, strict=True):
+        ours = {
+            module: th.where((source >= first) & (source < first + size), source - first, -1)
+            for module, source in sources.items()
+        }
+        reached = {names[module]: source for module, source in ours.items() if (source >= 0).any()}
+        outgoing = {name: source for name, source in reached.items() if _is_layer(network.get_submodule(name))}
+        norms = {name: source for name, source in reached.items() if name not in outgoing}
+        if outgoing and not elsewhere[first : first + size].any():
+            found.append(HiddenUnits(names[layer], size, outgoing, norms))
+        first += size
+    return found
+
+
+def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable[[], Any]) -> list[th.Tensor]:
+    """
+    :param network: The network
+    :param layers: Its hidden units
+    :param run: Calls it on a batch of observations
+    :return: For each layer, :func:`~sb3_cchain.analysis.metrics.dormancy.mean_activity` of its units ``(n_units,)``, where
+        the next layers receive them
+    """
+    modules = {network.get_submodule(name): name for layer in layers for name in layer.outgoing}
+    activity: dict[str, th.Tensor] = {}
+
+    def measure(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
+        activity[modules[module]] = mean_activity(_channels_last(module, inputs[0]))
+
+    with forward_hooks(modules, measure), th.no_grad():
+        run()
+
+    of_layers = []
+    for layer in layers:
+        received = th.cat([activity[name][source >= 0] for name, source in layer.outgoing.items()])
+        units = th.cat([source[source >= 0] for source in layer.outgoing.values()])
+        total = received.new_zeros(layer.n_units).index_add(0, units, received)
+        of_layers.append(total / units.bincount(minlength=layer.n_units))
+    return of_layers
+
+
+def _is_layer(module: nn.Module) -> bool:
+    return isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)) and getattr(module, "groups", 1) == 1
+
+
+def _channel_dim(module: nn.Module) -> int:
+    return -1 if isinstance(module, nn.Linear) else 1
+
+
+def _channels_last(module: nn.Module, inputs: th.Tensor) -> th.Tensor:
+    """As a matrix: batch and positions, channels."""
+    return inputs.movedim(_channel_dim(module), -1).flatten(end_dim=-2)
+
+
+def _read(all_tags: th.Tensor, tagged: th.Tensor) -> th.Tensor:
+    """The index in ``all_tags`` of each channel, or -1."""
+    index = th.searchsorted(all_tags, tagged[0].contiguous()).clamp(max=len(all_tags) - 1)
+    return th.where((tagged == all_tags[index]).all(dim=0), index, -1)
+
+
+def _feeds_more(tagged: th.Tensor, source: th.Tensor, tags: list[th.Tensor]) -> th.Tensor:
+    """For each tag, whether it has part in these inputs other than by being one of them."""
+    weights = th.arange(1.0, len(source) + 1, dtype=tagged.dtype, device=tagged.device)
+    gradients = th.autograd.grad(tagged.mean(dim=0) @ weights, tags, retain_graph=True, materialize_grads=True)
+    known = source >= 0
+    expected = th.zeros_like(th.cat(gradients)).index_add(0, source[known], weights[known])
+    return ~th.isclose(th.cat(gradients), expected, rtol=1e-3)

@@ -1,0 +1,43 @@
+"""Logs what wrapped optimisers did."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.networks.model_optimizers import model_optimizers
+
+
+class OptimizerMetrics(BaseCallback):
+    """
+    Logs the metrics of the model's optimisers, as ``trac/scale`` and ``l2_init/distance``: at each rollout's end, or, with
+    off-policy algorithms, at each episode's. They tell of the updates before it.
+
+    With actor and critic apart (SAC, TD3) the names end in ``_actor`` and ``_critic``.
+
+    It raises a ``TypeError`` when no optimiser of the model is an :class:`~sb3_cchain.methods.OptimizerWrapper`.
+    """
+
+    def _init_callback(self) -> None:
+        optimizers = model_optimizers(self.model)
+        if not any(isinstance(optimizer, OptimizerWrapper) for optimizer in optimizers.values()):
+            names = ", ".join(type(optimizer).__name__ for optimizer in optimizers.values())
+            raise TypeError(
+                "OptimizerMetrics needs an optimiser of sb3_cchain.methods, as policy_kwargs=dict(optimizer_class=TRAC); "
+                f"{type(self.model).__name__} has {names or 'none'}"
+            )
+
+    def _on_step(self) -> bool:
+        # Off-policy rollouts are a few steps long
+        if not isinstance(self.model, OnPolicyAlgorithm) and any(self.locals["dones"]):
+            self._log()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if isinstance(self.model, OnPolicyAlgorithm):
+            self._log()
+
+    def _log(self) -> None:
+        for name, optimizer in model_optimizers(self.model).items():
+            if isinstance(optimizer, OptimizerWrapper):
+                for key, value in optimizer.metrics().items():
+                    self.logger.record(f"{key}_{name}" if name else key, value)

@@ -1,0 +1,99 @@
+"""Shrink-and-perturb."""
+
+from typing import Any
+
+import torch as th
+
+from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
+from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.validation import check_number
+
+
+class ShrinkAndPerturb(TaskBoundary):
+    r"""
+    Moves all trained parameters towards a fresh draw :math:`\phi` of their initialisation,
+
+    .. math:: \theta \leftarrow \alpha \theta + (1 - \alpha) \phi
+
+    after every ``interval`` gradient updates, or at each task switch.
+
+    Shrink-and-perturb (Ash & Adams, NeurIPS 2020, https://arxiv.org/abs/1910.08475) is
+    :math:`\theta \leftarrow \lambda \theta + p` with noise :math:`p` each time that new data arrive. The convex combination
+    with a fresh network, the step after every update and its default are those of Plasticine
+    (https://github.com/RLE-Foundation/Plasticine), whose *soft* variant is that of Juliani & Ash (NeurIPS 2024,
+    https://arxiv.org/abs/2405.19153), where it goes together with LayerNorm. Plasticine's *hard* variant, every so many
+    iterations, is a greater ``interval``.
+
+    Each step builds the policy anew, which with ``interval=1`` may cost more than the update itself. A step with
+    :math:`\alpha^n` after every :math:`n` updates shrinks alike at an n-th of the cost.
+
+    The optimiser's moments and the target network are left alone. With C-CHAIN, a step after an update counts as part of it,
+    also in its churn; at a task switch the reference batch is forgotten, so that churn reduction does not undo the step.
+
+    Logged: ``shrink_and_perturb/n_steps``, the steps since ``learn()`` was called.
+
+    :param shrink: α
+    :param interval: Gradient updates (minibatches) between two steps; None for one step at each task switch of a continual
+        environment instead, for which α should be far smaller, such as 0.5
+    :raises ValueError: When ``shrink`` is not between 0 and 1, or ``interval`` neither None nor a positive integer
+    :raises TypeError: When training starts, for algorithms with several optimisers, and with ``interval=None`` for an
+        environment that is not continual
+    """
+
+    _hook: th.utils.hooks.RemovableHandle | None = None
+
+    def __init__(self, shrink: float = 0.999999, interval: int | None = 1):
+        super().__init__()
+        check_number("shrink", shrink, 0, 1)
+        if interval is not None:
+            check_number("interval", interval, 1, integer=True)
+        self.shrink = shrink
+        self.interval = interval
+
+    def _init_callback(self) -> None:
+        require_policy_optimizer(self)
+
+    def _on_training_start(self) -> None:
+        self._on_training_end()  # of training that was interrupted
+        self.n_steps = 0
+        if self.interval is None:
+            super()._on_training_start()
+        else:
+            self._n_updates = 0
+            self._hook = self.model.policy.optimizer.register_step_post_hook(self._after_update)
+
+    def _on_training_end(self) -> None:
+        if self._hook is not None:
+            self._hook.remove()
+            self._hook = None
+
+    def _after_update(self, *_: Any) -> None:
+        assert self.interval is not None
+        self._n_updates += 1
+        if self._n_updates % self.interval == 0:
+            self._shrink_and_perturb()
+
+    def _on_rollout_start(self) -> None:
+        if self.interval is None:
+            super()._on_rollout_start()
+
+    def _on_step(self) -> bool:
+        return super()._on_step() if self.interval is None else True
+
+    def _on_task_switch(self) -> None:
+        self._shrink_and_perturb()
+        for reducer in churn_reducers(self):
+            reducer.forget_reference()
+
+    def _shrink_and_perturb(self) -> None:
+        fresh = fresh_policy(self.model)
+        # What the optimiser trains: of DQN the Q-network without its target
+        with th.no_grad():
+            for group, fresh_group in zip(self.model.policy.optimizer.param_groups, fresh.optimizer.param_groups, strict=True):
+                for parameter, draw in zip(group["params"], fresh_group["params"], strict=True):
+                    parameter.mul_(self.shrink).add_(draw, alpha=1 - self.shrink)
+        self.n_steps += 1
+
+    def _on_rollout_end(self) -> None:
+        self.logger.record("shrink_and_perturb/n_steps", self.n_steps)

@@ -1,0 +1,17 @@
+"""Feature extractors, policies and activations, and how to read the networks of any Stable-Baselines3 model."""
+
+from sb3_cchain.networks.activations import CReLU
+from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
+from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.networks.mlp_policies import CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
+
+__all__ = [
+    "CReLU",
+    "CReLUDQNPolicy",
+    "CReLUPolicy",
+    "ImpalaCNN",
+    "ImpalaPolicy",
+    "LayerNormDQNPolicy",
+    "LayerNormPolicy",
+    "MinAtarCNN",
+]

@@ -1,0 +1,114 @@
+"""SB3's MLP policies with LayerNorm or with CReLU."""
+
+from typing import Any, ClassVar
+
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+from torch import nn
+
+from sb3_cchain.networks.activations import CReLU
+
+
+def hidden_layers(
+    n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module], layer_norm: bool
+) -> tuple[list[nn.Module], int]:
+    """
+    Linear layers, each followed by a LayerNorm (on request) and the activation.
+
+    :param n_inputs: Number of inputs
+    :param net_arch: Units of each layer
+    :param activation_fn: Makes the activation; with :class:`CReLU` a layer has twice as many outputs as units
+    :param layer_norm: Whether there is a LayerNorm before each activation
+    :return: The modules, and the number of outputs of the last one
+    """
+    modules: list[nn.Module] = []
+    for n_units in net_arch:
+        modules.append(nn.Linear(n_inputs, n_units))
+        if layer_norm:
+            modules.append(nn.LayerNorm(n_units))
+        modules.append(activation_fn())
+        n_inputs = n_units * getattr(modules[-1], "expansion", 1)
+    return modules, n_inputs
+
+
+class _MlpVariant(ActorCriticPolicy):
+    layer_norm: ClassVar[bool] = False
+
+    def _build_mlp_extractor(self) -> None:
+        if isinstance(self.net_arch, dict):
+            pi, vf = self.net_arch.get("pi", []), self.net_arch.get("vf", [])
+        else:
+            pi = vf = self.net_arch
+        extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
+        policy_net, extractor.latent_dim_pi = hidden_layers(self.features_dim, pi, self.activation_fn, self.layer_norm)
+        value_net, extractor.latent_dim_vf = hidden_layers(self.features_dim, vf, self.activation_fn, self.layer_norm)
+        extractor.policy_net, extractor.value_net = nn.Sequential(*policy_net), nn.Sequential(*value_net)
+        self.mlp_extractor = extractor.to(self.device)
+
+
+class LayerNormPolicy(_MlpVariant):
+    """
+    SB3's ``MlpPolicy`` for PPO and A2C with a LayerNorm (https://arxiv.org/abs/1607.06450; against the loss of plasticity:
+    Lyle et al. 2024, https://arxiv.org/abs/2402.18762) in each hidden layer, after the linear map and before the activation.
+    There is none on the observations, on the features (images: give their extractor ``layer_norm=True``) or on the outputs.
+
+    All arguments are those of ``ActorCriticPolicy``, with the same defaults; ``net_arch`` is a list or a dict. ``ortho_init``
+    initialises the linear layers as usual; the norms begin as the identity. For ``Dict`` observations give
+    ``features_extractor_class=CombinedExtractor``.
+    """
+
+    layer_norm = True
+
+
+class CReLUPolicy(_MlpVariant):
+    """
+    SB3's ``MlpPolicy`` for PPO and A2C with :class:`CReLU` as activation: a layer of ``n`` units in ``net_arch`` has ``2 n``
+    outputs, so every layer but the first has twice as many weights.
+
+    :param args: Arguments of ``ActorCriticPolicy``
+    :param kwargs: Keyword arguments of ``ActorCriticPolicy``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"activation_fn": CReLU, **kwargs})
+
+
+class _QNetworkVariant(QNetwork):
+    def __init__(self, *args: Any, layer_norm: bool, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        modules, n_features = hidden_layers(self.features_dim, self.net_arch, self.activation_fn, layer_norm)
+        self.q_net = nn.Sequential(*modules, nn.Linear(n_features, int(self.action_space.n)))
+
+
+class _DQNVariant(DQNPolicy):
+    layer_norm: ClassVar[bool] = False
+
+    def make_q_net(self) -> QNetwork:
+        """
+        :return: A Q-network
+        """
+        # Extractors of their own for the network and its target, as in SB3
+        net_args = self._update_features_extractor(self.net_args, features_extractor=None)
+        return _QNetworkVariant(**net_args, layer_norm=self.layer_norm).to(self.device)
+
+
+class LayerNormDQNPolicy(_DQNVariant):
+    """
+    SB3's ``MlpPolicy`` for DQN with a LayerNorm in each hidden layer, as in :class:`LayerNormPolicy`. All arguments are those
+    of ``DQNPolicy``, with the same defaults.
+    """
+
+    layer_norm = True
+
+
+class CReLUDQNPolicy(_DQNVariant):
+    """
+    SB3's ``MlpPolicy`` for DQN with :class:`CReLU` as activation, as in :class:`CReLUPolicy`.
+
+    :param args: Arguments of ``DQNPolicy``
+    :param kwargs: Keyword arguments of ``DQNPolicy``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"activation_fn": CReLU, **kwargs})

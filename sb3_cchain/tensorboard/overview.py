@@ -1,0 +1,42 @@
+"""A TensorBoard in which nothing needs to be arranged: charts in groups, and the hyperparameters."""
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+from sb3_cchain.tensorboard.hyperparameters import TensorBoardHyperparameters, hyperparameters
+from sb3_cchain.tensorboard.layout import TensorBoardLayout
+
+
+class TensorBoardOverview(BaseCallback):
+    """
+    Groups the charts of a run in TensorBoard's Custom Scalars tab, and writes the hyperparameters to its HPARAMS tab.
+
+    The charts are those of returns, C-CHAIN, monitored churn, the NTK, network health and related methods of which something
+    is logged. The hyperparameters are the arguments of the model, and the names of its algorithm, policy and environment.
+
+    ``CChainPPO`` and ``CChainDQN`` do so by themselves, and so do ``CChainCallback``, ``ContinualMetrics`` and all callbacks
+    that look at networks during training. Give it to other algorithms without those. Nothing is done twice, nothing at all for
+    a model that does not log to TensorBoard. Hyperparameters that the user logs by SB3's ``HParam`` stand instead of these.
+    """
+
+    def _on_training_start(self) -> None:
+        add_overview(self.model)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def add_overview(model: BaseAlgorithm) -> None:
+    """
+    What :class:`TensorBoardOverview` does, once for each logger.
+
+    :param model: A model that is about to be trained
+    """
+    outputs = model.logger.output_formats
+    if any(isinstance(output, TensorBoardLayout) for output in outputs):
+        return
+    for output in outputs:
+        if isinstance(output, TensorBoardOutputFormat):
+            outputs += [TensorBoardLayout(output.writer), TensorBoardHyperparameters(output.writer, hyperparameters(model))]
+            return

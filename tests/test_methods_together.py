@@ -1,0 +1,118 @@
+"""The baselines that act by callbacks and networks, all at once, with each algorithm; and all baselines with C-CHAIN."""
+
+import pytest
+import torch as th
+from stable_baselines3 import DQN
+
+from sb3_cchain import TaskSync
+from sb3_cchain.methods import (
+    TRAC,
+    AdamRel,
+    L2Init,
+    OptimizerMetrics,
+    Oracle,
+    ReDo,
+    ShrinkAndPerturb,
+    WeightClipping,
+)
+from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
+from tests.method_models import ALGORITHMS, STEPS_PER_TASK, go_on, make_env, make_model, make_random_env, parameters
+
+NESTED = dict(
+    optimizer_class=TRAC,
+    optimizer_kwargs=dict(s_init=0.1, base_class=L2Init, base_kwargs=dict(coef=0.1, base_class=WeightClipping)),
+)
+
+
+def callbacks():
+    return [TaskSync(), Oracle(), ReDo(tau=0.3, interval=1), ShrinkAndPerturb(shrink=0.999, interval=2)]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_train_save_load_and_go_on(tmp_path, name):
+    policy = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
+    model = make_model(name, policy=policy, policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU))
+    first = callbacks()
+    model.learn(STEPS_PER_TASK + 16, callback=first).save(tmp_path / "model")
+    _, oracle, redo, shrink = first
+    assert oracle.n_resets == 1 and redo.n_recycled > 0 and shrink.n_steps > 0
+
+    loaded = type(model).load(tmp_path / "model", env=make_env(), device="cpu")
+    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
+    state, loaded_state = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
+    assert len(state) > 0
+    for index, moments in state.items():
+        assert all(th.equal(value, loaded_state[index][key]) for key, value in moments.items())
+    before, second = parameters(loaded), callbacks()
+    if isinstance(loaded, DQN):
+        loaded.learning_starts = loaded.num_timesteps + 4
+    loaded.learn(STEPS_PER_TASK, callback=second, reset_num_timesteps=False)
+    assert second[1].n_resets == 1
+    assert all(not th.equal(tensor, before[name]) for name, tensor in parameters(loaded).items() if "target" not in name)
+    loaded.set_parameters(model.get_parameters())
+    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_repeats_with_the_seed(name):
+    one, other = (make_model(name).learn(2 * STEPS_PER_TASK, callback=callbacks()) for _ in range(2))
+    assert all(th.equal(p, q) for p, q in zip(one.policy.parameters(), other.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("everything", [False, True])
+@pytest.mark.parametrize("name", ["CChainPPO", "CChainDQN"])
+def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
+    """ReDo alone, and all that can be together."""
+
+    def callbacks():
+        redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
+        return [redo, ShrinkAndPerturb(shrink=0.999), AdamRel(), OptimizerMetrics()] if everything else [redo]
+
+    layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
+    model = make_model(
+        name,
+        env=make_random_env(),
+        policy=layer_norm if everything else "MlpPolicy",
+        policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU, **(NESTED if everything else {})),
+    )
+    model.learn(48, callback=(first := callbacks()), log_interval=1000)
+    assert first[0].n_recycled > 0
+    keys = {"redo/n_recycled", "churn/loss"}
+    if everything:
+        keys |= {"trac/scale", "l2_init/distance", "weight_clipping/share", "adam_rel/n_resets", "shrink_and_perturb/n_steps"}
+    assert keys <= set(model.logger.name_to_value)
+
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", env=make_random_env(), device="cpu")
+    if isinstance(model, DQN):
+        model.save_replay_buffer(tmp_path / "buffer")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+    before = parameters(model)
+    for each in (model, loaded):
+        go_on(each, callbacks())
+    after, after_loading = parameters(model), parameters(loaded)
+    assert all(th.equal(tensor, after_loading[parameter]) for parameter, tensor in after.items())
+    assert any(not th.equal(tensor, before[parameter]) for parameter, tensor in after.items())
+    # TRAC's scale may have fallen to 0, the moments are of the gradients all the same
+    moments, moments_after_loading = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
+    for parameter in range(len(model.policy.optimizer.param_groups[0]["params"])):
+        assert moments[parameter]["exp_avg"].any()
+        assert all(th.equal(value, moments_after_loading[parameter][key]) for key, value in moments[parameter].items())
+
+
+def test_by_name_from_yaml():
+    """As the stock RL Zoo reads `policy:`, `policy_kwargs:` and `callback:`."""
+    utils = pytest.importorskip("rl_zoo3.utils")
+    entries = [
+        "sb3_cchain.TaskSync",
+        {"sb3_cchain.methods.Oracle": {"reset_replay_buffer": True}},
+        {"sb3_cchain.methods.ReDo": {"tau": 0.1, "interval": 5}},
+        {"sb3_cchain.methods.ShrinkAndPerturb": {"shrink": 0.5, "interval": None}},
+    ]
+    made = utils.get_callback_list({"callback": entries})
+    policy = utils.get_class_by_name("sb3_cchain.networks.LayerNormDQNPolicy")
+    activation_fn = utils.get_class_by_name("sb3_cchain.networks.CReLU")
+    model = make_model("DQN", policy=policy, policy_kwargs=dict(net_arch=[8], activation_fn=activation_fn))
+    model.learn(2 * STEPS_PER_TASK, callback=made)
+    assert made[1].n_resets == made[3].n_steps == 1
+    assert made[2].tau == 0.1
