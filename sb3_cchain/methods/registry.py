@@ -1,0 +1,158 @@
+"""
+One row for each method that an experiment can run: C-CHAIN, the algorithms without it, and the related methods.
+
+The command line, the search spaces, the benchmark, its report, its curves and its timings all read this table. To add a
+method, add a row, its YAML file and its page; the tests say what is missing.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
+from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.methods.oracle import Oracle
+from sb3_cchain.methods.parseval import Parseval
+from sb3_cchain.methods.redo import ReDo
+from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.trac import TRAC
+from sb3_cchain.methods.weight_clipping import WeightClipping
+from sb3_cchain.networks import CReLU, CReLUPolicy, LayerNormPolicy
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A method, as settings of an algorithm.
+
+    :param name: Name of the method, the same for all algorithms: in the paper's tables, and of the folders of results
+    :param algo: Name on the command line, and of the YAML file ``zoo_hyperparams/<algo>.yml``
+    :param algorithm: Class of the algorithm
+    :param label: Name in tables and legends
+    :param color: Colour in plots, a name of matplotlib's
+    :param page: Page of the documentation, without its suffix, below ``docs/``
+    :param suites: Suites in which the paper compares it; none where the paper does not have it
+    :param optimizer_class: Wrapper of the optimiser, where the method is one
+    :param optimizer_kwargs: Those of its arguments that have no default
+    :param callbacks: Callbacks of the method
+    :param policy: Its policy for ``MlpPolicy``, where the method is a network
+    :param policy_kwargs: Arguments of that policy
+    :param grid: Values that ``-optimize`` searches, by argument of the optimiser wrapper or, where there is none, of the first
+        of ``callbacks``
+    """
+
+    name: str
+    algo: str
+    algorithm: type[BaseAlgorithm]
+    label: str
+    color: str
+    page: str
+    suites: tuple[str, ...] = ()
+    optimizer_class: type[OptimizerWrapper] | None = None
+    optimizer_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    callbacks: tuple[type[BaseCallback], ...] = ()
+    policy: str | type[BasePolicy] = "MlpPolicy"
+    policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    grid: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    @property
+    def in_paper(self) -> bool:
+        """Whether the paper has it."""
+        return bool(self.suites)
+
+    @property
+    def is_related(self) -> bool:
+        """Whether it is settings of an algorithm, not an algorithm of its own."""
+        return bool(self.optimizer_class or self.callbacks or self.policy != "MlpPolicy")
+
+
+PPO_SUITES = ("gym_control", "procgen", "dmc")
+OPTIMIZER_PAGE, PLASTICITY_PAGE = "modules/optimizers", "modules/plasticity"
+
+# In the order of the report's tables
+REGISTRY = (
+    Method("oracle", "ppo_oracle", PPO, "Oracle", "tab:brown", PLASTICITY_PAGE, PPO_SUITES, callbacks=(Oracle,)),
+    Method(
+        "oracle", "double_dqn_oracle", DoubleDQN, "Oracle", "tab:brown", PLASTICITY_PAGE, ("minatar",), callbacks=(Oracle,)
+    ),
+    Method("vanilla", "ppo", PPO, "PPO", "tab:gray", "modules/ppo_cchain", PPO_SUITES),
+    Method("vanilla", "double_dqn", DoubleDQN, "Double DQN", "tab:gray", "modules/dqn_cchain", ("minatar",)),
+    Method(
+        *("trac", "ppo_trac", PPO, "TRAC", "tab:orange", OPTIMIZER_PAGE, ("gym_control", "procgen")),
+        optimizer_class=TRAC,
+        callbacks=(OptimizerMetrics,),
+    ),
+    Method(
+        *("weight_clipping", "ppo_weight_clipping", PPO, "Weight clipping", "tab:green", OPTIMIZER_PAGE),
+        suites=("gym_control", "procgen"),
+        optimizer_class=WeightClipping,
+        callbacks=(OptimizerMetrics,),
+        grid={"clip_ratio": [0.1, 0.5, 1.0, 10.0]},  # the paper's
+    ),
+    Method(
+        *("l2_init", "ppo_l2_init", PPO, "L2 Init", "tab:red", OPTIMIZER_PAGE, ("gym_control", "procgen")),
+        optimizer_class=L2Init,
+        callbacks=(OptimizerMetrics,),
+        grid={"coef": [0.1, 1.0, 10.0, 100.0, 1000.0]},  # the paper's
+    ),
+    Method(
+        *("layer_norm", "ppo_layer_norm", PPO, "LayerNorm", "tab:purple", PLASTICITY_PAGE, ("procgen",)),
+        policy=LayerNormPolicy,
+    ),
+    Method(
+        *("redo", "ppo_redo", PPO, "ReDo", "tab:pink", PLASTICITY_PAGE, ("procgen",)),
+        callbacks=(ReDo,),
+        # The paper has no grid. τ: dead units alone, the value of ReDo's DQN, and four times that. Interval in iterations:
+        # Plasticine's, a tenth and ten times that
+        grid={"tau": [0.0, 0.025, 0.1], "interval": [1, 10, 100]},
+    ),
+    Method(
+        *("adam_rel", "ppo_adam_rel", PPO, "AdamRel", "tab:olive", OPTIMIZER_PAGE, ("procgen",)),
+        callbacks=(AdamRel,),
+    ),
+    Method(
+        *("parseval", "ppo_parseval", PPO, "Parseval", "tab:cyan", OPTIMIZER_PAGE),
+        optimizer_class=Parseval,
+        optimizer_kwargs={"n_output_layers": 2},
+        callbacks=(OptimizerMetrics,),
+        grid={"coef": [1e-5, 1e-4, 1e-3, 1e-2]},  # a decade around those of its code
+    ),
+    Method(
+        *("shrink_and_perturb", "ppo_shrink_and_perturb", PPO, "Shrink and perturb", "darkkhaki", PLASTICITY_PAGE),
+        callbacks=(ShrinkAndPerturb,),
+        # After every update (Plasticine's), and the same shrinkage at once after a hundred
+        grid={"shrink": [0.9999, 0.99999, 0.999999], "interval": [1, 100]},
+    ),
+    Method(
+        *("crelu", "ppo_crelu", PPO, "CReLU", "teal", PLASTICITY_PAGE),
+        policy=CReLUPolicy,
+        policy_kwargs={"activation_fn": CReLU},
+    ),
+    Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
+    Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
+)
+
+METHOD_NAMES = tuple(dict.fromkeys(method.name for method in REGISTRY))
+BY_ALGO = {method.algo: method for method in REGISTRY}
+
+
+def find_method(name: str, suite: str) -> Method:
+    """
+    :param name: Name of a method
+    :param suite: Name of a suite
+    :return: The row of the method for that suite's algorithm
+    :raises ValueError: When the method has no row for it
+    """
+    vanilla = next(method for method in REGISTRY if method.name == "vanilla" and suite in method.suites)
+    for method in REGISTRY:
+        if method.name == name and (suite in method.suites or issubclass(method.algorithm, vanilla.algorithm)):
+            return method
+    raise ValueError(f"There is no method {name!r} for the algorithm of {suite!r}, {vanilla.label}")
