@@ -1,20 +1,22 @@
-"""C-CHAIN for a stock ``PPO``: the form in which the stock ``rl_zoo3`` command reaches it."""
+"""C-CHAIN for a stock ``PPO``, for instance one that the stock ``rl_zoo3`` command trains."""
 
 from functools import partial
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import EventCallback
 
+from sb3_cchain.algorithms.churn_state import keep_churn_state
+from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
-from sb3_cchain.tasks.sync import TaskSwitch
+from sb3_cchain.tasks.sync import TaskSwitch, iterate_callbacks
 from sb3_cchain.tensorboard.overview import add_overview
 
-# Methods of the model, from the end of a rollout to train()
+# Methods of the model that are replaced from the end of a rollout to train()
 REPLACED = ("train", "_excluded_save_params")
 
 
-class CChainCallback(BaseCallback):
+class CChainCallback(FiniteCheck):
     """
     Trains a stock :class:`~stable_baselines3.PPO` as :class:`~sb3_cchain.CChainPPO` trains, for instance from the YAML file
     of the stock ``rl_zoo3``::
@@ -23,8 +25,11 @@ class CChainCallback(BaseCallback):
           - sb3_cchain.CChainCallback:
               target_churn_ratio: 1.0e+4
 
-    PPO calls its callbacks right before each ``train()``, whose next call is then made with churn reduction. Unlike with
-    ``CChainPPO``, the saved model does not hold the history of λ: training resumed from it warms up again.
+    PPO calls its callbacks right before each ``train()``; the callback then makes the next ``train()`` reduce churn. The
+    history of λ and the reference batch are kept with the model and saved with it. Training with a CChainCallback goes on
+    with them, whether the model was loaded or ``learn()`` was called again. The stock ``PPO.load`` loads such a model, too.
+
+    Rewards and observations that are NaN or infinite raise a ``ValueError`` before they are trained on.
 
     :param churn_coef: As for ``CChainPPO``
     :param target_churn_ratio: As for ``CChainPPO``
@@ -34,7 +39,9 @@ class CChainCallback(BaseCallback):
     :param reset_churn_coef: As for ``CChainPPO``
     :param churn_base_loss: As for ``CChainPPO``
     :param churn_component: As for ``CChainPPO``
-    :raises ValueError: Naming the argument that is out of its range
+    :raises ValueError: Naming the argument that is out of its range; when training starts, for a second CChainCallback in the
+        same ``learn()``, and for one that another callback holds
+    :raises TypeError: When training starts, for a model that is not a stock PPO
     """
 
     model: PPO
@@ -59,26 +66,41 @@ class CChainCallback(BaseCallback):
             window=churn_window,
             minimum=churn_coef_min,
         )
-        self._make_coefficient(default_target_ratio=1.0)  # bad values shall fail now
+        self._make_coefficient(default_target_ratio=1.0)  # raise on bad values now
         check_choices(churn_base_loss, churn_component)
         self.churn_base_loss = churn_base_loss
         self.churn_component = churn_component
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
-        self._reduced_model: PPO | None = None
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, PPO):
             raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
         if hasattr(self.model, "churn_reducer"):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
+        if isinstance(self.parent, EventCallback):
+            raise ValueError(
+                f"CChainCallback must be called at every rollout, but {type(self.parent).__name__} holds it: "
+                "give it to `learn()` beside the other callbacks"
+            )
         add_overview(self.model)
-        # Another learn() of the same model goes on with the same λ
-        if self._reduced_model is not self.model:
-            self._reduced_model = self.model
-            self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
+        self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
+        past, n_updates = vars(self.model).get("churn_state"), self.model._n_updates
+        self._state = keep_churn_state(self.model, self.churn_reducer, self._task_switch, past, n_updates)
+        self._state.n_updates = n_updates
+
+    def _on_training_start(self) -> None:
+        n_callbacks = sum(isinstance(callback, CChainCallback) for callback in iterate_callbacks(self.locals["callback"]))
+        if n_callbacks > 1:
+            raise ValueError(
+                f"`learn()` was given {n_callbacks} CChainCallbacks, which would add the churn loss {n_callbacks} times: "
+                "give it one"
+            )
+        # Tells this call of learn() from others
+        self._start_time = self.model.start_time
 
     def _on_step(self) -> bool:
+        super()._on_step()
         if self.reset_churn_coef and self._task_switch.happened(self.locals["infos"]):
             self.churn_reducer.coefficient.reset()
         return True
@@ -90,11 +112,16 @@ class CChainCallback(BaseCallback):
 
         def train_once() -> None:
             self._on_training_end()  # first, so that it is gone when train() fails, too
+            if self.model.start_time != self._start_time:
+                # Left from a learn() that was interrupted between the end of a rollout and train()
+                train()
+                return
             with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
                 train()
+            self._state.n_updates = self.model._n_updates
 
         self.model.train = train_once  # type: ignore[method-assign]
-        # A model that is saved at this point must not take it along: loaded, it would train the model that it came from
+        # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
         self.model._excluded_save_params = lambda: not_saved  # type: ignore[method-assign]
 
     def _on_training_end(self) -> None:

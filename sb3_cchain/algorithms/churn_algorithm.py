@@ -4,10 +4,12 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
+from sb3_cchain.algorithms.churn_state import keep_churn_state
+from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
 from sb3_cchain.tasks.sync import TaskSwitch
@@ -16,9 +18,9 @@ from sb3_cchain.tensorboard.overview import add_overview
 
 class ChurnAlgorithm(BaseAlgorithm):
     """
-    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` that is saved with the model, the callbacks for
-    continual environments and the overview in TensorBoard to an SB3 algorithm. A subclass builds the reducer in
-    ``_make_churn_reducer()`` and uses it in ``train()``.
+    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` whose state is saved with the model, a check for NaN
+    in what the environment gives, the callbacks for continual environments and the overview in TensorBoard to an SB3
+    algorithm. A subclass builds the reducer in ``_make_churn_reducer()`` and uses it in ``train()``.
 
     :param args: Arguments of the base algorithm
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
@@ -27,10 +29,10 @@ class ChurnAlgorithm(BaseAlgorithm):
     :param target_churn_ratio: β, the size of λ·L_churn relative to the base loss. ``"auto"`` is a default for the kind of
         the network's outputs.
     :param churn_warmup: Calls of ``train()`` until λ adapts
-    :param churn_window: Calls of ``train()`` that the running means of both losses go over
+    :param churn_window: Calls of ``train()`` that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the code
-        released with the paper. C-CHAIN does not need to be told of a switch, hence not by default.
+        released with the paper. Off by default, because C-CHAIN does not need to be told of a switch.
     :param kwargs: Keyword arguments of the base algorithm
     :raises ValueError: Naming the churn argument that is out of its range
     """
@@ -54,7 +56,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         self.churn_window = churn_window
         self.churn_coef_min = churn_coef_min
         self.reset_churn_coef = reset_churn_coef
-        # Bad values shall fail before an environment is made
+        # Raise on bad values before an environment is made
         self._make_churn_coefficient(default_target_ratio=1.0)
         self._task_switch = TaskSwitch()
         super().__init__(*args, **kwargs)
@@ -75,19 +77,25 @@ class ChurnAlgorithm(BaseAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
         self.churn_reducer = self._make_churn_reducer()
+        # `load()` puts in the state that was saved, as a dict, and calls `set_parameters()` next, which takes it
+        if not isinstance(vars(self).get("churn_state"), dict):
+            keep_churn_state(self, self.churn_reducer, self._task_switch)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
-        return super()._init_callback(with_continual_callbacks(callback, self.env), progress_bar)
+        if not isinstance(callback, (BaseCallback, list)):
+            callback = ConvertCallback(callback)  # a function, or None
+        given = callback if isinstance(callback, list) else [callback]
+        return super()._init_callback(with_continual_callbacks([*given, FiniteCheck()], self.env), progress_bar)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)
         if self.reset_churn_coef and self._task_switch.happened(infos):
             self.churn_reducer.coefficient.reset()
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, torch_variables = super()._get_torch_save_params()
-        return [*state_dicts, "churn_reducer"], torch_variables
+    def _excluded_save_params(self) -> list[str]:
+        # They are in `churn_state`
+        return [*super()._excluded_save_params(), "churn_reducer", "_task_switch"]
 
     def set_parameters(
         self,
@@ -96,26 +104,22 @@ class ChurnAlgorithm(BaseAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        As in SB3. Parameters of the base algorithm, which have no churn history, are accepted too: churn reduction starts
-        over. When another kind of λ or another window was asked for on loading, λ starts over.
+        As in SB3. A saved model brings its history of λ and its reference batch. A dict of parameters, or a model of the base
+        algorithm, has none: churn reduction starts over. λ also starts over when it is of another kind, or has another
+        window, than that of the saved model.
 
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters()`` returned
         :param exact_match: Whether all parameters must be given
         :param device: Device to load a saved model to
         """
-        params: Any
         if isinstance(load_path_or_dict, dict):
-            params = load_path_or_dict
+            params: Any = load_path_or_dict
+            past, n_updates = vars(self).get("churn_state"), self._n_updates
+            if not isinstance(past, dict):  # not called by `load()`
+                past = None
         else:
-            _, params, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
-        # Without a history of their own, the parameters are those of a network that has not churned yet
-        fresh = self._make_churn_reducer().state_dict()
-        state = params.get("churn_reducer", fresh)
-        if _shapes(state) != _shapes(fresh):
-            state = {**fresh, "_extra_state": state["_extra_state"]}
-        super().set_parameters({**params, "churn_reducer": state}, exact_match, device)
-        self.churn_reducer.move_reference(self.device)
-
-
-def _shapes(state: dict[str, Any]) -> dict[str, th.Size]:
-    return {key: value.shape for key, value in state.items() if th.is_tensor(value)}
+            data, params, _ = load_from_zip_file(load_path_or_dict, device=device)
+            past, n_updates = (data or {}).get("churn_state"), (data or {}).get("_n_updates", 0)
+        super().set_parameters(params, exact_match, device)
+        self.churn_reducer = self._make_churn_reducer()
+        keep_churn_state(self, self.churn_reducer, self._task_switch, past, n_updates)

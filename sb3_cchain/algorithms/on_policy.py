@@ -1,6 +1,5 @@
 """Churn reduction of an unmodified ``PPO.train()``: where reference batches come from, where the gradient goes in."""
 
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -9,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, component_backward, extra_gradient
@@ -26,7 +24,7 @@ from sb3_cchain.networks.policy_outputs import (
 from sb3_cchain.replaced import replaced
 
 
-def make_policy_reducer(model: OnPolicyAlgorithm, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
+def make_policy_reducer(model: PPO, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
     """
     :param model: A model, whose policy exists
     :param make_coefficient: Makes λ, given the default β of the policy's kind of outputs
@@ -34,14 +32,20 @@ def make_policy_reducer(model: OnPolicyAlgorithm, make_coefficient: Callable[[fl
     :raises TypeError: When the policy's action distribution is not supported
     """
     divergence = policy_divergence(model.policy)
+    if model.verbose >= 1 and model.n_steps * model.n_envs <= model.batch_size:
+        print(
+            f"A rollout of n_steps * n_envs = {model.n_steps * model.n_envs} steps is a single minibatch of "
+            f"batch_size={model.batch_size}: there is no data outside it to measure churn on, so the minibatch is its own "
+            "reference batch. Choose a `batch_size` of at most half a rollout."
+        )
     return ChurnReducer(
-        partial(_outputs, model),  # which deepcopy() of the model follows, as it does not a closure
+        partial(_outputs, model),  # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
         divergence,
         make_coefficient(DEFAULT_TARGET_RATIO[divergence]),
     )
 
 
-def _outputs(model: OnPolicyAlgorithm, observations: PyTorchObs) -> th.Tensor:
+def _outputs(model: PPO, observations: PyTorchObs) -> th.Tensor:
     return policy_outputs(model.policy, observations)
 
 
@@ -49,9 +53,9 @@ class ReferenceBatches:
     """
     Stands in for ``rollout_buffer.get`` and pairs each minibatch of an epoch with another one as its reference batch.
 
-    The minibatches of an epoch are a random partition of the rollout, so any other minibatch is a random sample that
-    shares nothing with this one (the paper's B_ref ∩ B_train = ∅) and that SB3 has to gather anyway. It is the one half
-    an epoch away.
+    The minibatches of an epoch are a random partition of the rollout. Any other minibatch is therefore a random sample that
+    shares nothing with this one (the paper's B_ref ∩ B_train = ∅), and SB3 gathers it anyway. The one half an epoch away is
+    taken. An epoch of a single minibatch has no other data: the minibatch is its own reference batch.
 
     :param get: The rollout buffer's ``get(batch_size)``
     """
@@ -59,8 +63,6 @@ class ReferenceBatches:
     # The reference batch of the minibatch that is being trained on, and whether that is the first of its epoch
     current: PyTorchObs
     starts_epoch: bool
-    # Whether an epoch had a single minibatch, which then is its own reference batch
-    overlapping = False
 
     def __init__(self, get: Callable[..., Iterator[Any]]):
         self._get = get
@@ -71,7 +73,6 @@ class ReferenceBatches:
         :return: The minibatches of one epoch
         """
         minibatches = list(self._get(batch_size))
-        self.overlapping |= len(minibatches) == 1
         distance = (len(minibatches) + 1) // 2
         for position, minibatch in enumerate(minibatches):
             self.current = minibatches[(position + distance) % len(minibatches)].observations
@@ -87,7 +88,7 @@ def check_choices(churn_base_loss: str, churn_component: str) -> None:
     """
     :param churn_base_loss: The argument
     :param churn_component: The argument
-    :raises ValueError: When it is none that there is
+    :raises ValueError: When one of them is not among the allowed values
     """
     for name, value, allowed in (
         ("churn_base_loss", churn_base_loss, BASE_LOSSES),
@@ -107,8 +108,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
     - ``churn/loss``: mean churn loss L_churn over the updates
     - ``churn/coef``: the λ it was multiplied by
     - ``churn/relative_loss``: λ·L_churn / \\|L\\|, which an adaptive λ holds near β
-    - ``churn/policy_churn``: L_churn less its value were there no churn at all; for discrete actions the
-      Kullback-Leibler divergence from the policy before an update to the one after it
+    - ``churn/policy_churn``: L_churn minus its value without any churn; for discrete actions the Kullback-Leibler
+      divergence from the policy before an update to the one after it
     - ``churn/value_churn``: mean absolute change of the state values by an update, the first of each epoch that another
       follows
 
@@ -116,7 +117,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
 
     :param model: A PPO model
     :param reducer: Its churn reducer
-    :param base_loss: What L is: ``"actor"``, the clipped surrogate and the entropy bonus; ``"surrogate"``, the former alone
+    :param base_loss: What L is: ``"actor"`` for the clipped surrogate and the entropy bonus, ``"surrogate"`` for the clipped
+        surrogate alone
     :param component: Which component of the churn gradient is used: ``"full"``, ``"projection"`` or ``"orthogonal"``
     """
     policy, rollout_buffer = model.policy, model.rollout_buffer
@@ -144,13 +146,6 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
     ):
         yield
 
-    if references.overlapping and not reducer.warned_of_overlap:
-        reducer.warned_of_overlap = True
-        warnings.warn(
-            f"A rollout of n_steps * n_envs = {model.n_steps * model.n_envs} steps is a single minibatch of "
-            f"batch_size={model.batch_size}: there is no data outside it to measure churn on, so the minibatch is its own "
-            "reference batch. Choose a `batch_size` of at most half a rollout."
-        )
     if reducer.losses:
         logged = model.logger.name_to_value
         loss = logged["train/policy_gradient_loss"]

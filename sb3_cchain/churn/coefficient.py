@@ -1,9 +1,16 @@
 """The weight λ of the churn loss: fixed, or set so that the churn loss keeps its ratio to the base loss."""
 
+import math
+from collections.abc import Callable
+from typing import Any
+
 import torch as th
 from torch import nn
 
 from sb3_cchain.validation import check_number
+
+# λ multiplies a loss in single precision
+GREATEST = th.finfo(th.float32).max
 
 
 class ChurnCoefficient(nn.Module):
@@ -11,11 +18,12 @@ class ChurnCoefficient(nn.Module):
     A fixed λ. Also the interface of every λ: ``value``, ``update(base_loss, churn_loss)``, ``reset()``.
 
     :param initial: λ; 0 switches churn reduction off
+    :raises ValueError: When it is negative, NaN, infinite or beyond single precision
     """
 
     def __init__(self, initial: float):
         super().__init__()
-        check_number("churn_coef", initial, minimum=0)
+        _check_factor("churn_coef", initial)
         self.initial = float(initial)
 
     @property
@@ -34,7 +42,14 @@ class ChurnCoefficient(nn.Module):
 
         :param base_loss: The loss that the churn loss is added to
         :param churn_loss: The churn loss, not multiplied by λ
+        :raises ValueError: When one of them is NaN or infinite; nothing has changed then
         """
+        for name, loss in (("base_loss", base_loss), ("churn_loss", churn_loss)):
+            if not math.isfinite(loss):
+                raise ValueError(
+                    f"`{name}` must be finite, got {loss}: look for NaN or infinite rewards and observations, or a learning "
+                    "rate that is too high."
+                )
 
     def reset(self) -> None:
         """Forget the losses seen, as the released code does when the task switches."""
@@ -45,15 +60,16 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
     :math:`\lambda = \beta \, \overline{|L|} \, / \, \overline{|L_{churn}|}`, with running means over a window
     (Appendix A.1 of the C-CHAIN paper; warm-up, window and minimum as in the released code).
 
-    An iteration is whatever is between two calls of ``update``: one ``train()`` of PPO, one gradient step of DQN.
-    The history is kept in buffers, in double precision, and so is saved and restored with ``state_dict``. An update costs
-    the same whatever the window.
+    An iteration is what happens between two calls of ``update``: one ``train()`` of PPO, one gradient step of DQN.
+    The history is kept in buffers, in double precision and on the CPU, so it is saved and restored with ``state_dict``. An
+    update costs the same for any window.
 
     :param target_ratio: β, the size of λ·L_churn relative to L
     :param initial: λ during the warm-up
     :param warmup: Iterations (calls of ``update``) until λ adapts
     :param window: Iterations that the running means go over
     :param minimum: λ after the warm-up is at least this
+    :raises ValueError: Naming the argument that is out of its range
     """
 
     base_losses: th.Tensor
@@ -63,18 +79,22 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
 
     def __init__(self, target_ratio: float, initial: float = 1.0, warmup: int = 10, window: int = 50, minimum: float = 0.0):
         super().__init__(initial)
-        check_number("target_churn_ratio", target_ratio, minimum=0, exclusive=True)
+        _check_factor("target_churn_ratio", target_ratio, exclusive=True)
         check_number("churn_warmup", warmup, minimum=0, integer=True)
         check_number("churn_window", window, minimum=1, integer=True)
-        check_number("churn_coef_min", minimum, minimum=0)
+        _check_factor("churn_coef_min", minimum)
         self.target_ratio = float(target_ratio)
         self.warmup = warmup
         self.minimum = float(minimum)
-        self.register_buffer("base_losses", th.zeros(window, dtype=th.float64))
-        self.register_buffer("churn_losses", th.zeros(window, dtype=th.float64))
+        self.register_buffer("base_losses", th.zeros(window, dtype=th.float64, device="cpu"))
+        self.register_buffer("churn_losses", th.zeros(window, dtype=th.float64, device="cpu"))
         # Of the base and the churn losses in the window
-        self.register_buffer("sums", th.zeros(2, dtype=th.float64))
-        self.register_buffer("n_seen", th.zeros((), dtype=th.int64))
+        self.register_buffer("sums", th.zeros(2, dtype=th.float64, device="cpu"))
+        self.register_buffer("n_seen", th.zeros((), dtype=th.int64, device="cpu"))
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> "AdaptiveChurnCoefficient":
+        """Stay on the CPU in double precision, which not every device has: only numbers go in and out."""
+        return self
 
     @property
     def value(self) -> float:
@@ -98,13 +118,15 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
 
         :param base_loss: The loss that the churn loss is added to; its absolute value counts
         :param churn_loss: The churn loss, not multiplied by λ; its absolute value counts
+        :raises ValueError: When one of them is NaN or infinite; nothing has changed then
         """
+        super().update(base_loss, churn_loss)
         slot = int(self.n_seen) % len(self.base_losses)
         for index, (history, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
             forgotten = float(history[slot])
             history[slot] = abs(loss)
             self.sums[index] += abs(loss) - forgotten
-            # Anew once per window, and when most of it leaves, so that rounding errors neither add up nor stay behind
+            # Recompute the sum once per window, and when most of it leaves, so that rounding errors do not add up or stay
             if slot == len(history) - 1 or forgotten > self.sums[index]:
                 self.sums[index] = history.sum()
         self.n_seen += 1
@@ -150,7 +172,7 @@ def make_coefficient(
     if isinstance(churn_coef, str) and churn_coef.startswith("auto"):
         if churn_coef != "auto":
             adaptive.initial = _number("churn_coef", churn_coef, churn_coef.removeprefix("auto_"), _CHURN_COEF)
-            check_number("churn_coef", adaptive.initial, minimum=0)
+            _check_factor("churn_coef", adaptive.initial)
         return adaptive
     return ChurnCoefficient(_number("churn_coef", churn_coef, churn_coef, _CHURN_COEF))
 
@@ -166,3 +188,9 @@ def _number(name: str, value: object, number: object, alternatives: str) -> floa
         return float(number)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise ValueError(f"`{name}` must be a number, {alternatives}; got {value!r}") from None
+
+
+def _check_factor(name: str, value: float, exclusive: bool = False) -> None:
+    check_number(name, value, minimum=0, exclusive=exclusive)
+    if value > GREATEST:
+        raise ValueError(f"`{name}` must be at most {GREATEST:.3g}, the greatest number in single precision, got {value!r}")

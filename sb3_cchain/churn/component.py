@@ -18,16 +18,20 @@ def gradient_component(churn: Sequence[th.Tensor], base: Sequence[th.Tensor], co
     :param base: Gradient of the base loss, :math:`g`, of the same shapes
     :param component: ``"projection"``, ``"orthogonal"``, or ``"full"`` for their sum
     :return: The component, a tensor for each parameter
-    :raises ValueError: For any other component
+    :raises ValueError: For any other component, and when the gradients are not of the same parameters
     """
     if component not in COMPONENTS:
         raise ValueError(f"`component` must be one of {', '.join(map(repr, COMPONENTS))}, got {component!r}")
+    shapes = [[tuple(gradient.shape) for gradient in gradients] for gradients in (churn, base)]
+    if shapes[0] != shapes[1] or not shapes[0]:
+        raise ValueError(f"`churn` and `base` must hold a gradient of each parameter, got shapes {shapes[0]} and {shapes[1]}")
     if component == "full":
         return list(churn)
-    # In double precision: the square of a small gradient's norm is 0 in single precision
-    inner_product = sum((c.double() * b.double()).sum() for c, b in zip(churn, base, strict=True))
-    squared_norm = sum(b.double().square().sum() for b in base)
-    share = th.as_tensor(inner_product / squared_norm).nan_to_num(0.0, 0.0, 0.0)
+    # In double precision: the square of a small gradient's norm is 0 in single precision. Apple's GPUs have no other.
+    dtype = th.float32 if base[0].device.type == "mps" else th.float64
+    inner_product = sum((c.to(dtype) * b.to(dtype)).sum() for c, b in zip(churn, base, strict=True))
+    squared_norm = th.as_tensor(sum(b.to(dtype).square().sum() for b in base))
+    share = th.where(squared_norm == 0, 0.0, inner_product / squared_norm)
     projection = [share * b for b in base]
     if component == "projection":
         return projection

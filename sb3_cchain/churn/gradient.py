@@ -1,4 +1,4 @@
-"""Adds a gradient of one's own to every update of somebody else's training loop."""
+"""Adds a gradient to every update of a training loop that cannot be changed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

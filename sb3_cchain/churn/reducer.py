@@ -1,5 +1,6 @@
 """The churn loss of a network against itself one update ago, for any training loop."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,19 +24,20 @@ class ChurnReducer(nn.Module):
             loss(network(batch)).backward()
             optimizer.step()
 
-    Update :math:`t-1` was made on ``batch``; the churn that it caused is how far the outputs on its ``reference`` moved,
-    :math:`L_{churn}(\theta_t) = D(f_{\theta_{t-1}}(x_{ref}), f_{\theta_t}(x_{ref}))`, and update :math:`t` is made on the
+    Update :math:`t-1` was made on ``batch``. The churn that it caused is how far the outputs on its ``reference`` moved,
+    :math:`L_{churn}(\theta_t) = D(f_{\theta_{t-1}}(x_{ref}), f_{\theta_t}(x_{ref}))`. Update :math:`t` is made on the
     usual loss plus :math:`\lambda L_{churn}`. The released code copies the network at every update to have
-    :math:`\theta_{t-1}`. Here the outputs that are needed of it are computed while it is still the current network, so no
-    copy is made: one forward pass, and one forward and backward pass per update.
+    :math:`\theta_{t-1}`. Here the outputs that it is needed for are computed while it is still the current network. This
+    takes no copy, but one forward pass, and one forward and backward pass, per update.
 
-    The first update has no previous one, and so no churn loss.
+    The first update has no churn loss, because there is no update before it.
 
     The reference batch that awaits its next update, the outputs on it, and the history of λ are in ``state_dict()``.
 
     :param outputs: Maps observations to the outputs that should not churn. Called with gradients enabled or disabled.
     :param divergence: Compares outputs before and after, ``divergence(old, new)``
     :param coefficient: λ
+    :raises TypeError: When ``outputs`` or ``divergence`` cannot be called, or ``coefficient`` is a number
     """
 
     def __init__(
@@ -45,17 +47,23 @@ class ChurnReducer(nn.Module):
         coefficient: ChurnCoefficient,
     ):
         super().__init__()
-        # Not a submodule, where it is a module: the network is not part of the reducer's state
+        for name, function in (("outputs", outputs), ("divergence", divergence)):
+            if not callable(function):
+                raise TypeError(f"`{name}` must be a function, got {function!r}")
+        if not isinstance(coefficient, ChurnCoefficient):
+            raise TypeError(f"`coefficient` must be a ChurnCoefficient, as ChurnCoefficient(0.1), got {coefficient!r}")
+        # In a list, so that a network is not registered as a submodule: it is not part of the reducer's state
         self._outputs = [outputs]
         self.divergence = divergence
         self.coefficient = coefficient
-        # Whether the training loop has warned that it found no reference batch outside the minibatch
-        self.warned_of_overlap = False
         self.reference: Observations | None = None
         self.old_outputs: th.Tensor | None = None
-        # Since the last `end_iteration()`, one for each update: the churn loss, and the outputs before and after
+        # The churn loss of each update since the last `end_iteration()`
         self.losses: list[float] = []
-        self.compared: list[tuple[th.Tensor, th.Tensor]] = []
+        # The outputs on the reference batch before and after the last update that was measured, without gradient
+        self.last_change: tuple[th.Tensor, th.Tensor] | None = None
+        # Over the samples since the last `end_iteration()`: their number, and the sum of the loss beyond that of no change
+        self._n_samples, self._churn_sum = 0, 0.0
 
     def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> None:
         """
@@ -65,7 +73,8 @@ class ChurnReducer(nn.Module):
 
         :param reference: Observations outside the minibatch of the update that is about to be made
         :param backward: Takes λ·L_churn and adds its gradient
-        :raises ValueError: When the churn loss is NaN or infinite. The parameters have not been touched.
+        :raises ValueError: When the churn loss, or λ times it, is NaN or infinite, or the reference batch is empty. The
+            parameters and their gradients have not been touched.
         """
         if self.reference is not None:
             with th.enable_grad():
@@ -80,20 +89,19 @@ class ChurnReducer(nn.Module):
 
         :param new_outputs: The present outputs on ``self.reference``, which must not be None
         :return: λ·L_churn
-        :raises ValueError: When the churn loss is NaN or infinite
+        :raises ValueError: When the churn loss, or λ times it, is NaN or infinite
         """
         assert self.old_outputs is not None
-        churn_loss = self.divergence(self.old_outputs, new_outputs)
-        loss = churn_loss.item()
-        if not -float("inf") < loss < float("inf"):
-            raise ValueError(
-                f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values. "
-                "The parameters have not been updated. Lower the learning rate or `churn_coef`, or set `max_grad_norm`."
-            )
         if not self.losses:  # λ changes between iterations only
             self._coef = self.coefficient.value
+        churn_loss = self.divergence(self.old_outputs, new_outputs)
+        loss = churn_loss.item()
+        _check_finite(loss, self._coef, th.finfo(churn_loss.dtype).max)
         self.losses.append(loss)
-        self.compared.append((self.old_outputs, new_outputs.detach()))
+        self.last_change = self.old_outputs, new_outputs.detach()
+        n_samples = len(new_outputs)
+        self._n_samples += n_samples
+        self._churn_sum += n_samples * (loss - self.divergence(self.old_outputs, self.old_outputs).item())
         return self._coef * churn_loss
 
     def remember(self, reference: Observations, outputs: th.Tensor | None = None) -> None:
@@ -102,45 +110,52 @@ class ChurnReducer(nn.Module):
 
         :param reference: Observations outside the minibatch of the update that is about to be made
         :param outputs: The outputs, without gradient, where the training loop has them
+        :raises ValueError: When the reference batch is empty
         """
         if outputs is None:
             with th.no_grad():
                 outputs = self._outputs[0](reference)
+        if outputs.numel() == 0:
+            raise ValueError(f"The reference batch must not be empty, got outputs of shape {tuple(outputs.shape)}")
         self.reference, self.old_outputs = reference, outputs
 
     def mean_churn(self) -> float:
         """
-        :return: Mean over the samples since the last ``end_iteration()`` of the churn loss less its value were there no churn;
+        :return: Mean over the samples since the last ``end_iteration()`` of the churn loss minus its value without any churn;
             with the cross-entropy, the Kullback-Leibler divergence KL(old ‖ new). NaN before the second update.
         """
-        if not self.losses:
-            return float("nan")
-        sizes = [len(old) for old, _ in self.compared]
-        mean_loss = sum(loss * size for loss, size in zip(self.losses, sizes, strict=True)) / sum(sizes)
-        unmoved = th.cat([old for old, _ in self.compared])
-        return mean_loss - self.divergence(unmoved, unmoved).item()
+        return self._churn_sum / self._n_samples if self._n_samples else float("nan")
 
     def end_iteration(self, base_loss: float) -> None:
         """
-        Give λ the losses since the last call; without an update in between there is nothing to give.
+        Adapt λ to the losses since the last call. Without an update in between, nothing happens.
 
         :param base_loss: The mean over these updates of the loss that the churn loss was added to
+        :raises ValueError: When it is NaN or infinite
         """
-        if self.losses:
-            self.coefficient.update(base_loss, sum(self.losses) / len(self.losses))
+        losses = self.losses
         self.discard_losses()
+        if losses:
+            self.coefficient.update(base_loss, sum(losses) / len(losses))
+
+    @property
+    def compared(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """The last change in a list, for the code of DQN."""
+        return [] if self.last_change is None else [self.last_change]
 
     def discard_losses(self) -> None:
         """Forget the losses since the last ``end_iteration()``, as when training was interrupted in between."""
-        self.losses, self.compared = [], []
+        self.losses = []
+        self.last_change = None
+        self._n_samples, self._churn_sum = 0, 0.0
 
     def forget_reference(self) -> None:
-        """Drop the reference batch: the next update has no churn loss (after the network was replaced, say)."""
+        """Drop the reference batch, for instance after the network was replaced: the next update has no churn loss."""
         self.reference = self.old_outputs = None
 
     def move_reference(self, device: th.device | str) -> None:
         """
-        :param device: Where the network is; the state that was loaded may come from elsewhere
+        :param device: The device of the network; a state that was loaded may come from another one
         """
         if isinstance(self.reference, dict):
             self.reference = {key: tensor.to(device) for key, tensor in self.reference.items()}
@@ -151,7 +166,7 @@ class ChurnReducer(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """
-        :return: What ``state_dict()`` holds beside the buffers
+        :return: What ``state_dict()`` holds besides the buffers
         """
         return {"reference": self.reference, "old_outputs": self.old_outputs}
 
@@ -161,3 +176,15 @@ class ChurnReducer(nn.Module):
         """
         self.reference = state["reference"]
         self.old_outputs = state["old_outputs"]
+
+
+def _check_finite(loss: float, coef: float, greatest: float) -> None:
+    if not math.isfinite(loss):
+        problem = f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values."
+        mend = "Look for NaN or infinite rewards, lower the learning rate or `churn_coef`, or set `max_grad_norm`."
+    elif coef > greatest or not abs(coef * loss) <= greatest:
+        problem = f"λ times the churn loss, {coef:.3g} * {loss:.3g}, is beyond the network's precision."
+        mend = "Look for huge rewards, or lower `target_churn_ratio` or `churn_coef`."
+    else:
+        return
+    raise ValueError(f"{problem} This update has not been made. {mend}")

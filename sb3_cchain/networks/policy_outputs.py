@@ -28,6 +28,7 @@ DEFAULT_TARGET_RATIO: dict[Divergence, float] = {cross_entropy: 1e4, mean_square
 _MODE_FREE_PACKAGES = (
     "stable_baselines3.",
     "sb3_cchain.",
+    "torch._dynamo.eval_frame",  # what torch.compile() wraps around a module
     "torch.nn.modules.activation",
     "torch.nn.modules.container",
     "torch.nn.modules.conv",
@@ -37,6 +38,14 @@ _MODE_FREE_PACKAGES = (
     "torch.nn.modules.pooling",
 )
 _MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
+
+
+def uncompiled(policy: nn.Module) -> nn.Module:
+    """
+    :param policy: A policy
+    :return: The policy itself, without the wrapper of ``torch.compile()``
+    """
+    return getattr(policy, "_orig_mod", policy)
 
 
 def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
@@ -67,7 +76,7 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
         ``MultiDiscrete`` (shorter sub-actions padded with 0) and ``(batch_size, n, 2)`` for ``MultiBinary`` actions;
         means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
     """
-    if _has_own_distribution(type(policy)):
+    if _has_own_distribution(type(uncompiled(policy))):
         return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
@@ -82,7 +91,7 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
     return outputs
 
 
-def _has_own_distribution(policy_class: type[ActorCriticPolicy]) -> bool:
+def _has_own_distribution(policy_class: type[nn.Module]) -> bool:
     return any(
         getattr(policy_class, name) is not getattr(ActorCriticPolicy, name)
         for name in ("get_distribution", "_get_action_dist_from_latent")

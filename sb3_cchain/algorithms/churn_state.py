@@ -1,0 +1,86 @@
+"""Keeps the state of churn reduction with the model, so that it is saved and training goes on with the same λ."""
+
+from copy import deepcopy
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.tasks.sync import TaskSwitch
+
+
+class ChurnState:
+    """
+    Stands as ``churn_state`` among a model's attributes, which SB3 pickles into the saved file. There it becomes a dict of
+    tensors and numbers. A stock algorithm loads it as one more attribute and ignores it, without this package, too.
+
+    :param model: The model
+    :param reducer: Its churn reducer
+    :param task_switch: What notices that the task has changed
+    """
+
+    def __init__(self, model: BaseAlgorithm, reducer: ChurnReducer, task_switch: TaskSwitch):
+        self.model = model
+        self.reducer = reducer
+        self.task_switch = task_switch
+        # `model._n_updates` after the last training with churn reduction; None when there is no other training
+        self.n_updates: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """
+        :return: The state at this moment
+        """
+        return {
+            "reducer": _map_tensors(lambda tensor: tensor.detach().cpu().clone(), self.reducer.state_dict()),
+            "task_id": self.task_switch.task_id,
+            "n_updates": self.model._n_updates if self.n_updates is None else self.n_updates,
+        }
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (list(self.as_dict().items()),)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ChurnState":
+        copied = ChurnState(deepcopy(self.model, memo), deepcopy(self.reducer, memo), deepcopy(self.task_switch, memo))
+        copied.n_updates = self.n_updates
+        return copied
+
+
+def keep_churn_state(
+    model: BaseAlgorithm, reducer: ChurnReducer, task_switch: TaskSwitch, past: Any = None, n_updates: int = 0
+) -> ChurnState:
+    """
+    Let ``reducer`` go on from a past state, and save its state with the model from now on.
+
+    λ starts over when the past one was of another kind or had another window. The reference batch is forgotten when the model
+    was trained without churn reduction in the meantime, because what changed on it is not the churn of one update.
+
+    :param model: A model
+    :param reducer: Its churn reducer, which is new
+    :param task_switch: What notices that the task has changed
+    :param past: The past state: a :class:`ChurnState`, or the dict of it in a saved file; None to start over
+    :param n_updates: ``_n_updates`` of the model with the past state, as it is now or was when it was saved
+    :return: The state, which is now ``model.churn_state``
+    """
+    if isinstance(past, ChurnState):
+        past = past.as_dict()
+    if past is not None:
+        saved, fresh = past["reducer"], reducer.state_dict()
+        same_kind = _shapes(saved) == _shapes(fresh)
+        reducer.load_state_dict(saved if same_kind else {**fresh, "_extra_state": saved["_extra_state"]})
+        reducer.move_reference(model.device)
+        task_switch.task_id = past["task_id"]
+        if past["n_updates"] != n_updates:
+            reducer.forget_reference()
+    state = model.churn_state = ChurnState(model, reducer, task_switch)  # type: ignore[attr-defined]
+    return state
+
+
+def _map_tensors(function: Any, state: Any) -> Any:
+    if isinstance(state, dict):
+        return {key: _map_tensors(function, value) for key, value in state.items()}
+    return function(state) if th.is_tensor(state) else state
+
+
+def _shapes(state: dict[str, Any]) -> dict[str, th.Size]:
+    return {key: value.shape for key, value in state.items() if th.is_tensor(value)}
