@@ -1,7 +1,9 @@
 """The torch-only part: divergences, λ, the reducer, the seam."""
 
+import gc
 import math
 import random
+import re
 import statistics
 
 import pytest
@@ -17,6 +19,7 @@ from sb3_cchain.churn import (
     make_coefficient,
     mean_squared_difference,
 )
+from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
 
 
 def test_cross_entropy_by_hand():
@@ -41,6 +44,27 @@ def test_mean_squared_difference_by_hand():
     old = th.tensor([[1.0, 2.0], [3.0, 4.0]])
     new = th.tensor([[1.0, 0.0], [3.0, 5.0]])
     assert mean_squared_difference(old, new).item() == pytest.approx((0 + 4 + 0 + 1) / 4)
+
+
+@pytest.mark.parametrize("function", [cross_entropy, mean_squared_difference, mean_absolute_change, action_changes])
+@pytest.mark.parametrize("old, new", [((2, 3), (3,)), ((2, 3), (1, 3)), ((2, 3), (2, 1)), ((2, 3), ()), ((0, 3), (2, 3))])
+def test_outputs_of_other_shapes_are_refused(function, old, new):
+    """PyTorch would broadcast them."""
+    for shapes in ((old, new), (new, old)):
+        with pytest.raises(ValueError, match=re.escape(f"same shape, got {shapes[0]} and {shapes[1]}")):
+            function(*map(th.ones, shapes))
+
+
+@pytest.mark.parametrize("function", [cross_entropy, mean_squared_difference, mean_absolute_change, action_changes])
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (2, 0), ()])
+def test_empty_batches_are_refused(function, shape):
+    with pytest.raises(ValueError, match=re.escape(f"not empty, got shape {shape}")):
+        function(th.ones(shape), th.ones(shape))
+
+
+def test_cross_entropy_needs_a_dimension_of_categories():
+    with pytest.raises(ValueError, match=r"batches of 2 or more dimensions .* got shape \(3,\)"):
+        cross_entropy(th.ones(3), th.ones(3))
 
 
 def test_adaptive_coefficient_by_hand():
@@ -80,6 +104,28 @@ def test_adaptive_coefficient_state_is_restored():
     for c in (coef, restored):
         c.update(3.0, 0.1)
     assert restored.value == coef.value
+
+
+@pytest.mark.parametrize("coef", [ChurnCoefficient(1.0), AdaptiveChurnCoefficient(1.0, warmup=0)])
+@pytest.mark.parametrize("losses, name", [((math.nan, 1.0), "base_loss"), ((1.0, -math.inf), "churn_loss")])
+def test_coefficient_refuses_losses_that_are_not_finite(coef, losses, name):
+    coef.update(2.0, 1.0)
+    before = coef.value
+    with pytest.raises(ValueError, match=f"`{name}` must be finite, got .*rewards"):
+        coef.update(*losses)
+    assert coef.value == before
+    coef.update(2.0, 1.0)
+    assert coef.value == before
+
+
+def test_history_stays_in_double_precision_on_the_cpu():
+    """Apple's GPUs have no double precision; "meta" stands for one."""
+    coef = AdaptiveChurnCoefficient(1.0, warmup=0)
+    reducer = ChurnReducer(make_network(), mean_squared_difference, coef).to("meta").to(th.float16)
+    coef.update(3.0, 1.0)
+    assert reducer.coefficient.value == pytest.approx(3.0)
+    assert {buffer.device.type for buffer in coef.buffers()} == {"cpu"}
+    assert coef.base_losses.dtype == th.float64
 
 
 @pytest.mark.parametrize("window", [1, 2, 7])
@@ -131,6 +177,12 @@ def test_churn_coef_is_read_as_ent_coef(value, initial, adaptive):
         ({"window": 0}, r"`churn_window` must be an integer greater than or equal to 1, got 0"),
         ({"window": 2.5}, r"`churn_window` must be an integer"),
         ({"minimum": -0.1}, r"`churn_coef_min` must be a number greater than or equal to 0, got -0.1"),
+        # Beyond single precision
+        ({"churn_coef": 1e39}, r"`churn_coef` must be at most 3.4e\+38, .* got 1e\+39"),
+        ({"churn_coef": "1e39"}, r"`churn_coef` must be at most .* got 1e\+39"),
+        ({"churn_coef": "auto_1e39"}, r"`churn_coef` must be at most .* got 1e\+39"),
+        ({"target_ratio": 1e45}, r"`target_churn_ratio` must be at most .* got 1e\+45"),
+        ({"minimum": 1e39}, r"`churn_coef_min` must be at most .* got 1e\+39"),
     ],
 )
 def test_bad_coefficient_arguments(changed, message):
@@ -144,6 +196,10 @@ def test_numpy_numbers_are_numbers():
 
     coef = AdaptiveChurnCoefficient(np.float32(2), warmup=np.int32(0), window=np.int64(5), minimum=np.float64(1))
     assert len(coef.base_losses) == 5
+
+
+def test_greatest_coefficient_is_allowed():
+    assert make_coefficient(3.4e38, 3.4e38, 1.0, warmup=0, window=1, minimum=3.4e38).value == 3.4e38
 
 
 def make_network(seed=0):
@@ -203,10 +259,80 @@ def test_reducer_standalone_against_written_out_loss():
         optimizers[1].zero_grad()
         loss.backward()
         optimizers[1].step()
-    for ours, theirs in zip(network.parameters(), plain.parameters(), strict=True):
-        assert th.allclose(ours, theirs, atol=1e-6)
+    for parameter, written_out in zip(network.parameters(), plain.parameters(), strict=True):
+        assert th.allclose(parameter, written_out, atol=1e-6)
     assert len(reducer.losses) == len(data) - 1  # the first update has no previous one
     assert not any(True for _ in reducer.parameters())  # the network is not part of its state
+
+
+def test_no_more_is_held_after_many_updates():
+    """Of tensors, whose batches may be large: the reference batch and its outputs, and the last outputs compared."""
+    reducer = ChurnReducer(make_network(), mean_squared_difference, ChurnCoefficient(1.0))
+    held = []
+    for _ in range(20):
+        reducer.backward(th.randn(8, 3))
+        held.append(sum(type(thing) is th.Tensor for thing in gc.get_objects()))
+    assert len(reducer.losses) == 19
+    assert held[5] == held[-1]
+
+
+@pytest.mark.parametrize("divergence", [cross_entropy, mean_squared_difference])
+def test_mean_churn_by_hand(divergence):
+    """Batches of different sizes: each sample counts the same, each update in the losses."""
+    generator = th.Generator().manual_seed(0)
+    old, new = (th.rand(12, 4, generator=generator).double().softmax(dim=1) for _ in range(2))
+    reducer = ChurnReducer(nn.Identity(), divergence, ChurnCoefficient(2.0))
+    assert math.isnan(reducer.mean_churn())
+    for part in (slice(0, 2), slice(2, 12)):
+        reducer.remember(None, old[part])
+        reducer.loss(new[part])
+        assert all(th.equal(*pair) for pair in zip(reducer.last_change, (old[part], new[part]), strict=True))
+    expected = divergence(old, new) - divergence(old, old)
+    assert reducer.mean_churn() == pytest.approx(expected.item(), rel=1e-9)
+    reducer.end_iteration(1.0)
+    assert math.isnan(reducer.mean_churn()) and reducer.losses == [] and reducer.last_change is None
+
+
+def test_reducer_refuses_an_empty_reference_batch():
+    network = make_network()
+    reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(1.0))
+    with pytest.raises(ValueError, match=r"reference batch must not be empty, got outputs of shape \(0, 2\)"):
+        reducer.backward(th.ones(0, 3))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((None, mean_squared_difference, ChurnCoefficient(1.0)), "`outputs` must be a function, got None"),
+        ((nn.Identity(), "mse", ChurnCoefficient(1.0)), "`divergence` must be a function, got 'mse'"),
+        ((nn.Identity(), mean_squared_difference, 0.1), "`coefficient` must be a ChurnCoefficient, .* got 0.1"),
+    ],
+)
+def test_bad_arguments_of_the_reducer(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        ChurnReducer(*arguments)
+
+
+@pytest.mark.parametrize("coef, change", [(1e38, 10.0), (1e30, 1e5)])
+def test_a_loss_beyond_the_precision_raises_before_the_gradient(coef, change):
+    network = make_network()
+    reducer = ChurnReducer(network, mean_squared_difference, ChurnCoefficient(coef))
+    reducer.backward(th.ones(4, 3))
+    reducer.old_outputs += change
+    with pytest.raises(
+        ValueError, match="λ times the churn loss, .* is beyond the network's precision.*not been made.*rewards"
+    ):
+        reducer.backward(th.ones(4, 3))
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+def test_a_base_loss_that_is_not_finite_is_named():
+    reducer = ChurnReducer(make_network(), mean_squared_difference, AdaptiveChurnCoefficient(1.0, warmup=0))
+    for _ in range(2):
+        reducer.backward(th.ones(4, 3))
+    with pytest.raises(ValueError, match="`base_loss` must be finite, got inf"):
+        reducer.end_iteration(math.inf)
+    assert reducer.coefficient.value == 1.0 and reducer.losses == []
 
 
 def test_reducer_state_is_restored():

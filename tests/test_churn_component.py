@@ -21,6 +21,17 @@ def test_components_by_hand():
     assert th.equal(th.cat(gradient_component(churn, base, "full")), th.cat(churn))
 
 
+@pytest.mark.parametrize("base", [[], [th.ones(3)], [th.ones(1, 2)], [th.ones(2), th.ones(2)]])
+def test_gradients_of_other_parameters_are_refused(base):
+    with pytest.raises(ValueError, match=r"a gradient of each parameter, got shapes \[\(2,\)\] and "):
+        gradient_component([th.ones(2)], base, "projection")
+
+
+def test_no_component_hides_a_gradient_that_is_not_a_number():
+    nan = [th.tensor([float("nan"), 1.0])]
+    assert gradient_component(nan, [th.ones(2)], "projection")[0].isnan().all()
+
+
 def test_nothing_lies_along_a_gradient_of_zeros():
     churn, base = [th.tensor([1.0, 2.0])], [th.zeros(2)]
     assert gradient_component(churn, base, "projection")[0].tolist() == [0.0, 0.0]

@@ -132,9 +132,10 @@ def test_reference_batch_shares_nothing_with_the_minibatch(n_steps, batch_size):
         assert len(set.union(*of_epoch)) == sum(map(len, of_epoch)) == n_steps
 
 
-def test_rollout_of_one_minibatch_warns_once():
-    model = CChainPPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, n_epochs=2, seed=0, device="cpu")
-    with pytest.warns(UserWarning, match=r"32 steps is a single minibatch of batch_size=32") as record:
-        model.learn(3 * 32)
-    assert len([w for w in record if "single minibatch" in str(w.message)]) == 1
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("verbose, n_lines", [(0, 0), (1, 1)])
+def test_rollout_of_one_minibatch_is_its_own_reference(verbose, n_lines, capsys):
+    model = CChainPPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, n_epochs=2, verbose=verbose, device="cpu")
+    model.learn(3 * 32)
+    assert capsys.readouterr().out.count("32 steps is a single minibatch of batch_size=32") == n_lines
     assert len(model.churn_reducer.coefficient.churn_losses.nonzero()) == 3

@@ -1,6 +1,7 @@
 """CChainPPO runs wherever PPO does, and says what it does."""
 
 import csv
+import re
 from copy import deepcopy
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -17,11 +18,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
-from sb3_cchain import CChainCallback, CChainPPO
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor
 from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.envs import RandomEnv
 
 SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu")
+DQN_SETTINGS = dict(learning_starts=20, buffer_size=100, batch_size=8, train_freq=1, seed=0, device="cpu")
 CHURN_KEYS = {"churn/policy_churn", "churn/value_churn", "churn/loss", "churn/coef", "churn/relative_loss"}
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -203,6 +205,8 @@ def test_not_a_number_raises_and_leaves_the_parameters_finite():
     [
         ({"churn_coef": -0.5}, "churn_coef"),
         ({"churn_coef": "sometimes"}, "churn_coef"),
+        ({"churn_coef": 1e39}, "churn_coef"),
+        ({"target_churn_ratio": 1e45}, "target_churn_ratio"),
         ({"target_churn_ratio": 0}, "target_churn_ratio"),
         ({"target_churn_ratio": "big"}, "target_churn_ratio"),
         ({"churn_warmup": 1.5}, "churn_warmup"),
@@ -213,7 +217,7 @@ def test_not_a_number_raises_and_leaves_the_parameters_finite():
 )
 @pytest.mark.parametrize("make", [lambda **kw: CChainPPO("MlpPolicy", "no environment is made", **kw), CChainCallback])
 def test_bad_churn_arguments(make, arguments, name):
-    with pytest.raises(ValueError, match=f"`{name}`.*got {next(iter(arguments.values()))!r}"):
+    with pytest.raises(ValueError, match=f"`{name}`.*got {re.escape(repr(next(iter(arguments.values()))))}"):
         make(**arguments)
 
 
@@ -243,8 +247,7 @@ def test_callback_leaves_nothing_behind_when_training_fails():
     model.learn(32)
 
 
-@pytest.mark.parametrize("n_callbacks", [1, 2])
-def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(n_callbacks, tmp_path):
+def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(tmp_path):
     class Save(BaseCallback):
         def _on_rollout_end(self):
             self.model.save(tmp_path / "model")
@@ -252,8 +255,7 @@ def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(n_callba
         def _on_step(self):
             return True
 
-    callbacks = [CChainCallback() for _ in range(n_callbacks)]
-    PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=[*callbacks, Save()])
+    PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=[CChainCallback(), Save()])
     loaded = PPO.load(tmp_path / "model", env=make_vec_env("CartPole-v1"), device="cpu")
     assert not {"train", "_excluded_save_params"} & set(vars(loaded))
     before = deepcopy(loaded.policy.state_dict())
@@ -261,11 +263,123 @@ def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(n_callba
     assert not th.equal(before["action_net.weight"], loaded.policy.action_net.weight)
 
 
-def test_callback_goes_on_with_its_history_and_may_be_given_twice():
+@pytest.mark.parametrize("another", [False, True])
+def test_another_call_of_learn_goes_on_with_the_history(another):
     callback = CChainCallback()
     model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(2 * 32, callback=callback)
-    model.learn(2 * 32, callback=[callback, CChainCallback()], reset_num_timesteps=False)
+    callback = CChainCallback() if another else callback
+    model.learn(2 * 32, callback=callback, reset_num_timesteps=False)
     assert callback.churn_reducer.coefficient.n_seen == 4
+
+
+def test_training_without_the_callback_in_between_is_no_churn():
+    callback, references = CChainCallback(), []
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=callback)
+    for between in (lambda: None, lambda: model.learn(32)):
+        between()
+        callback.init_callback(model)
+        references.append(callback.churn_reducer.reference)
+    assert references[0] is not None and references[1] is None
+    assert callback.churn_reducer.coefficient.n_seen == 1
+
+
+SAME = CChainCallback()
+
+
+@pytest.mark.parametrize(
+    "callbacks",
+    [
+        [CChainCallback(), CChainCallback()],
+        [SAME, SAME],
+        [CallbackList([CChainCallback()]), CallbackList([CallbackList([CChainCallback()])])],
+    ],
+    ids=["two", "the same twice", "nested"],
+)
+def test_two_callbacks_are_refused(callbacks):
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS)
+    with pytest.raises(ValueError, match=r"`learn\(\)` was given 2 CChainCallbacks.*give it one"):
+        model.learn(32, callback=callbacks)
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("argument", ["callback_after_eval", "callback_on_new_best"])
+def test_a_callback_held_by_another_is_refused(argument):
+    """It would be called at events alone, and reduce no churn."""
+    holder = EvalCallback(make_vec_env("CartPole-v1"), **{argument: CChainCallback()})
+    with pytest.raises(ValueError, match=r"EvalCallback holds it: give it to `learn\(\)`"):
+        PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=holder)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_interruption_before_the_update_leaves_nothing_that_reduces_churn(again):
+    class Interrupt(BaseCallback):
+        def _on_rollout_end(self):
+            raise KeyboardInterrupt
+
+        def _on_step(self):
+            return True
+
+    models = []
+    for callbacks in ([CChainCallback(), Interrupt()], [Interrupt()]):
+        models.append(PPO("MlpPolicy", "CartPole-v1", **SETTINGS))
+        with pytest.raises(KeyboardInterrupt):
+            models[-1].learn(32, callback=callbacks)
+        models[-1].learn(64, callback=CChainCallback() if again else None)
+        assert "train" not in vars(models[-1])
+    for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.equal(p, q)
+
+
+@pytest.mark.parametrize("make", [CChainPPO, CChainDQN, PPO])
+@pytest.mark.parametrize("monitor", [False, True])
+def test_a_compiled_policy(make, monitor, tmp_path):
+    settings = DQN_SETTINGS if make is CChainDQN else SETTINGS
+    models = []
+    for compiled in (False, True):
+        model = make("MlpPolicy", "CartPole-v1", **settings)
+        if compiled:
+            model.policy = th.compile(model.policy, backend="eager")
+        callbacks = [CChainCallback()] * (make is PPO) + [ChurnMonitor(interval=3)] * monitor
+        model.learn(96, callback=callbacks)
+        model.save(tmp_path / "model")
+        models += [model, make.load(tmp_path / "model", device="cpu")]
+    for model in models[1:]:
+        for p, q in zip(models[0].policy.parameters(), model.policy.parameters(), strict=True):
+            assert th.equal(p, q)
+    logged = [dict(model.logger.name_to_value) for model in models[::2]]
+    assert logged[0] == logged[1]
+    assert any(key.startswith("churn/") for key in logged[0])
+    assert any(key.startswith("churn_monitor/") for key in logged[0]) == monitor
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(env=RandomEnv(), n_steps=33, batch_size=8),  # the last minibatch has one sample
+        dict(env=RandomEnv(), n_steps=8, batch_size=1, n_epochs=1, normalize_advantage=False),
+        dict(env=RandomEnv(action_space=spaces.Discrete(1400))),
+        dict(env=RandomEnv(action_space=spaces.MultiDiscrete([700, 2]))),
+    ],
+    ids=["last of one", "one", "many actions", "many sub-actions"],
+)
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_unusual_sizes_stay_finite(arguments):
+    model = learn(**arguments)
+    assert all(np.isfinite(value) for key, value in model.logger.name_to_value.items() if key.startswith("churn/"))
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    "action_space", [spaces.Discrete(3), spaces.Box(-1, 1, (2,), np.float32)], ids=lambda space: type(space).__name__
+)
+def test_large_weights_stay_finite(action_space):
+    model = CChainPPO("MlpPolicy", RandomEnv(action_space=action_space), **SETTINGS)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.mul_(1e5)
+    model.learn(64)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    assert np.isfinite(model.churn_reducer.coefficient.value)
 
 
 class TemperedPolicy(ActorCriticPolicy):
