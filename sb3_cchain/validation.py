@@ -4,6 +4,8 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+
 
 def check_number(
     name: str,
@@ -37,6 +39,16 @@ def check_number(
     elif math.isfinite(minimum):
         expected += f" greater than {minimum:g}" if exclusive else f" greater than or equal to {minimum:g}"
     raise ValueError(f"`{name}` must be {expected}, got {value!r}")
+
+
+def check_bool(name: str, value: Any) -> None:
+    """
+    :param name: The argument's name
+    :param value: Its value; NumPy's booleans are booleans, strings and numbers are not
+    :raises TypeError: When it is not a boolean
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"`{name}` must be True or False, got {value!r}")
 
 
 def check_list(name: str, value: Any, of: str) -> list[Any]:

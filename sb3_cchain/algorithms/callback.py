@@ -9,7 +9,8 @@ from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
-from sb3_cchain.tasks.sync import TaskSwitch, iterate_callbacks
+from sb3_cchain.tasks.signal import TaskSwitch, step_task
+from sb3_cchain.tasks.sync import iterate_callbacks
 from sb3_cchain.tensorboard.overview import add_overview
 
 # Methods of the model that are replaced from the end of a rollout to train()
@@ -101,29 +102,4 @@ class CChainCallback(FiniteCheck):
 
     def _on_step(self) -> bool:
         super()._on_step()
-        if self.reset_churn_coef and self._task_switch.happened(self.locals["infos"]):
-            self.churn_reducer.coefficient.reset()
-        return True
-
-    def _on_rollout_end(self) -> None:
-        if self.churn_reducer.coefficient.is_zero:
-            return
-        train, not_saved = self.model.train, [*self.model._excluded_save_params(), *REPLACED]
-
-        def train_once() -> None:
-            self._on_training_end()  # first, so that it is gone when train() fails, too
-            if self.model.start_time != self._start_time:
-                # Left from a learn() that was interrupted between the end of a rollout and train()
-                train()
-                return
-            with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
-                train()
-            self._state.n_updates = self.model._n_updates
-
-        self.model.train = train_once  # type: ignore[method-assign]
-        # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
-        self.model._excluded_save_params = lambda: not_saved  # type: ignore[method-assign]
-
-    def _on_training_end(self) -> None:
-        for name in REPLACED:
-            vars(self.model).pop(name, None)
+        if self.reset_churn_coef and self._task_switch.happened(step_task(self.model, self.locals["infos"])):

@@ -12,7 +12,7 @@ from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
-from sb3_cchain.tasks.sync import TaskSwitch
+from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 
 
@@ -90,7 +90,7 @@ class ChurnAlgorithm(BaseAlgorithm):
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)
-        if self.reset_churn_coef and self._task_switch.happened(infos):
+        if self.reset_churn_coef and self._task_switch.happened(step_task(self, infos)):
             self.churn_reducer.coefficient.reset()
 
     def _excluded_save_params(self) -> list[str]:

@@ -1,7 +1,8 @@
 """Callbacks for training in continual environments: the paper's rollouts, and how well the agent does."""
 
-from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, read_returns
+from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
+from sb3_cchain.callbacks.returns_file import read_returns
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 from sb3_cchain.callbacks.task_learning_starts import TaskLearningStarts
 

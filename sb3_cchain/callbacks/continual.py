@@ -5,7 +5,8 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
-from sb3_cchain.tasks.sync import TaskSync, is_continual, iterate_callbacks
+from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.sync import TaskSync, iterate_callbacks
 
 
 def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> MaybeCallback:
@@ -23,5 +24,5 @@ def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> May
     else:
         given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
     present = list(iterate_callbacks(CallbackList(given)))
-    ours = (TaskSync, ContinualMetrics)
-    return [make() for make in ours if not any(isinstance(callback, make) for callback in present)] + given
+    needed = (TaskSync, ContinualMetrics)
+    return [make() for make in needed if not any(isinstance(callback, make) for callback in present)] + given

@@ -1,18 +1,17 @@
 """How well an agent does over a sequence of tasks, while it is trained."""
 
-import csv
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.tasks.sync import require_continual
+from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.tensorboard.overview import add_overview
-
-RETURNS_CSV = "returns.csv"
-COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
 
 
 class ContinualMetrics(BaseCallback):
@@ -21,109 +20,180 @@ class ContinualMetrics(BaseCallback):
 
     - ``continual/task_id``: the task being trained; ``continual/n_switches``: switches so far
     - ``continual/mean_return``: mean return of the episodes that ended in this rollout on that task
-    - ``continual/average_task_<i>``: :math:`J(\mathcal{T}_i)`, the mean of the above over the rollouts of task ``i``
+    - ``continual/reward_per_step``: mean reward of an environment step of this rollout on that task
+    - ``continual/average_task_<i>``: :math:`J(\mathcal{T}_i)`, the mean return of task ``i`` over its rollouts
     - ``continual/average_performance``: :math:`J(\mathbb{T})` so far, the mean of those over the tasks (Eq. 1 of the C-CHAIN
       paper)
 
-    Returns are the environment's own, whatever scales or normalises the rewards that the agent learns from.
-    Rollouts in which no episode ends count nowhere; off-policy algorithms, whose rollouts are the few steps between two
-    updates, so have a row per episode. An episode that is cut by a switch counts with its return up to there.
+    Rewards and returns are the environment's own, whatever scales or normalises the rewards that the agent learns from.
+    A rollout in which no episode ends does not count; off-policy algorithms, whose rollouts are the few steps between two
+    updates, have a row per episode. An episode that is cut by a switch counts with its return up to there.
+
+    A task whose episodes never end has no returns. Its reward per step counts as its return: where no episode of a task ended
+    before the switch cut it, or before training ended, the task has one row, with 0 episodes and the mean reward per
+    environment step of the whole task.
 
     The same goes to a CSV file, a line per rollout and task: environment steps at the end of the rollout, task, number of
     episodes that ended, their mean return. They are kept with the model, as ``model.continual_returns``, too, so that training
-    that is resumed continues both.
+    that is resumed continues both. When training begins at step 0, a file that is there already is kept as ``<name>.1`` (or
+    the next free number).
+
+    In an environment that is not continual the rewards are those before ``VecNormalize``. It is one task, and each further
+    environment that ``set_env()`` gives, followed by ``learn(..., reset_num_timesteps=False)``, is the next one.
 
     ``CChainPPO`` adds the callback by itself in a continual environment; give it to other algorithms.
 
     :param path: The CSV file; by default ``returns.csv`` in the folder of the logs, if the model has ``tensorboard_log``
         or was given a logger by ``set_logger()``
+    :raises ValueError: When training starts, if the file is not a file of returns, is damaged, or is being written by another
+        process
+    :raises TypeError: If the environment's ``info["task_id"]`` is not an integer
     """
 
     def __init__(self, path: str | Path | None = None):
         super().__init__()
         self.path = None if path is None else Path(path)
         self._finished: dict[int, list[float]] = defaultdict(list)
+        self._endless: dict[int, float] = {}
+        self._file: ReturnsFile | None = None
 
     def _on_training_start(self) -> None:
-        require_continual(self, self.training_env)
         add_overview(self.model)
         self._finished.clear()
-        # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
-        has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
-        folder = self.logger.get_dir() if has_folder else None
-        self._open_path = self.path or (Path(folder) / RETURNS_CSV if folder is not None else None)
-        past = getattr(self.model, "continual_returns", [])
-        if not past and self._open_path is not None and self._open_path.exists():
-            past = read_returns(self._open_path)
-        # Rows of training that was lost after the last save are dropped: they will come again
-        self.rows = [row for row in past if row["timesteps"] <= self.num_timesteps]
+        self._endless.clear()
+        is_new = self.num_timesteps == 0
+        # Of the task being trained, kept with the model: the rewards and steps so far, and the episodes that ended
+        state = None if is_new else getattr(self.model, "continual_state", None)
+        if state is None:
+            state = {"task_id": None, "n_switches": 0, "reward": 0.0, "n_steps": 0, "n_episodes": 0}
+        self._state: dict[str, Any] = state
+        self.model.continual_state = self._state  # type: ignore[attr-defined]
+        self._switch = TaskSwitch(state["task_id"])
+
+        path = self._find_path()
+        past = [] if is_new else getattr(self.model, "continual_returns", [])
+        if not past and not is_new and path is not None and path.exists():
+            past = read_returns(path)
+        # Rows of training that was lost after the last save will come again. The row of an endless task that goes on, too.
+        self.rows = [
+            row
+            for row in past
+            if row["timesteps"] <= self.num_timesteps
+            and not (row["n_episodes"] == 0 and row["task_id"] == state["task_id"] and state["n_steps"] > 0)
+        ]
         self.model.continual_returns = self.rows  # type: ignore[attr-defined]
+        self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new)
         self._averages: dict[int, float] = task_averages(self.rows)
         self._average_performance = float(np.mean(list(self._averages.values()))) if self._averages else np.nan
         self._n_rows = Counter(int(row["task_id"]) for row in self.rows)
-        if self._open_path is not None:
-            self._open_path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self._open_path, "w", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                writer.writerows(self.rows)
-        self._task_id, self._n_switches = -1, 0
+
+        self._vec_normalize = self.model.get_vec_normalize_env()
+        self._returns = np.zeros(self.training_env.num_envs)
+        self._rollout_reward, self._rollout_steps = 0.0, 0
+
+    def _find_path(self) -> Path | None:
+        # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
+        has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
+        folder = self.logger.get_dir() if has_folder else None
+        return self.path or (Path(folder) / RETURNS_CSV if folder is not None else None)
 
     def _on_step(self) -> bool:
-        infos = self.locals["infos"]
-        if self._task_id not in (-1, infos[0]["task_id"]):
-            self._n_switches += 1
-        self._task_id = infos[0]["task_id"]
-        for info, done in zip(infos, self.locals["dones"], strict=True):
-            if done:
-                self._finished[info["task_id"]].append(info["episode_return"])
+        infos, dones = self.locals["infos"], self.locals["dones"]
+        task_id = step_task(self.model, infos)
+        if self._switch.happened(task_id):
+            self._state["n_switches"] += 1
+        if self._state["task_id"] != task_id:
+            self._begin_task(task_id)
+        self._count_rewards(infos)
+        if dones.any():
+            self._count_episodes(infos, dones)
         return True
 
-    def _on_rollout_end(self) -> None:
-        new = [
-            dict(zip(COLUMNS, (self.num_timesteps, task_id, len(returns), float(np.mean(returns))), strict=True))
-            for task_id, returns in sorted(self._finished.items())
-        ]
-        self._finished.clear()
-        self.rows += new
-        if self._open_path is not None and new:
-            with open(self._open_path, "a", newline="") as file:
-                csv.DictWriter(file, COLUMNS).writerows(new)
+    def _begin_task(self, task_id: Any) -> None:
+        if not isinstance(task_id, Integral):
+            raise TypeError(f'ContinualMetrics needs an integer as `info["task_id"]`, got {task_id!r}')
+        self._state.update(task_id=task_id, reward=0.0, n_steps=0, n_episodes=0)
+        self._rollout_reward, self._rollout_steps = 0.0, 0
 
-        self.logger.record("continual/task_id", self._task_id)
-        self.logger.record("continual/n_switches", self._n_switches)
+    def _count_rewards(self, infos: list[dict[str, Any]]) -> None:
+        if "task_reward" in infos[0]:
+            rewards = np.array([info["task_reward"] for info in infos])
+        elif self._vec_normalize is not None:
+            rewards = self._vec_normalize.get_original_reward()
+        else:
+            rewards = self.locals["rewards"]
+        self._returns += rewards
+        reward = float(rewards.sum())
+        self._state["reward"] += reward
+        self._state["n_steps"] += len(infos)
+        self._rollout_reward += reward
+        self._rollout_steps += len(infos)
+
+    def _count_episodes(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
+        state, is_over = self._state, episode_task(self.model) != self._state["task_id"]
+        ended = np.flatnonzero(dones)
+        # At a switch, an episode that was truncated was cut by it
+        state["n_episodes"] += sum(not (is_over and infos[index].get("TimeLimit.truncated", False)) for index in ended)
+        if state["n_episodes"] > 0:
+            self._finished[state["task_id"]] += [self._episode_return(infos[index], index) for index in ended]
+        else:
+            self._endless[state["task_id"]] = state["reward"] / state["n_steps"]
+            state.update(reward=0.0, n_steps=0)
+        self._returns[ended] = 0.0
+
+    def _episode_return(self, info: dict[str, Any], index: int) -> float:
+        if "episode_return" in info:
+            return info["episode_return"]
+        # Monitor's, if there is one, also knows of resets that are not at the end of an episode
+        return float(info["episode"]["r"] if "episode" in info else self._returns[index])
+
+    def _take_rows(self) -> list[dict[str, float]]:
+        """The rows since the last call, which are written and kept."""
+        values = {task_id: (len(returns), float(np.mean(returns))) for task_id, returns in self._finished.items()}
+        values.update({task_id: (0, reward) for task_id, reward in self._endless.items()})
+        new = [dict(zip(COLUMNS, (self.num_timesteps, task_id, *values[task_id]), strict=True)) for task_id in sorted(values)]
+        self._finished.clear()
+        self._endless.clear()
+        self.rows += new
+        if self._file is not None and new:
+            self._file.append(new)
+        return new
+
+    def _on_rollout_end(self) -> None:
+        new, present_task = self._take_rows(), self._state["task_id"]
+        self.logger.record("continual/task_id", present_task)
+        self.logger.record("continual/n_switches", self._state["n_switches"])
+        if self._rollout_steps > 0:
+            self.logger.record_mean("continual/reward_per_step", self._rollout_reward / self._rollout_steps)
+            self._rollout_reward, self._rollout_steps = 0.0, 0
         for row in new:
             task_id = int(row["task_id"])
             self._n_rows[task_id] += 1
             average = self._averages.get(task_id, 0.0)
             self._averages[task_id] = average + (row["mean_return"] - average) / self._n_rows[task_id]
             self.logger.record(f"continual/average_task_{task_id}", self._averages[task_id])
-            if task_id == self._task_id:
+            if task_id == present_task:
                 self.logger.record_mean("continual/mean_return", row["mean_return"])
         if new:
             self._average_performance = float(np.mean(list(self._averages.values())))
         if self._averages:
             self.logger.record("continual/average_performance", self._average_performance)
 
+    def _on_training_end(self) -> None:
+        state = self._state
+        if state["n_episodes"] == 0 and state["n_steps"] > 0:
+            self._endless[state["task_id"]] = state["reward"] / state["n_steps"]
+        self._take_rows()
+        if self._file is not None:
+            self._file.close()
+
 
 def task_averages(rows: Sequence[Mapping[str, float]]) -> dict[int, float]:
     r"""
-    :param rows: Rows of :func:`read_returns`
+    :param rows: Rows of :func:`~sb3_cchain.callbacks.read_returns`
     :return: :math:`J(\mathcal{T}_i)` by task: the mean over its rollouts of the mean return of their episodes
     """
     by_task: dict[int, list[float]] = defaultdict(list)
     for row in rows:
         by_task[int(row["task_id"])].append(row["mean_return"])
     return {task_id: float(np.mean(returns)) for task_id, returns in by_task.items()}
-
-
-def read_returns(path: str | Path) -> list[dict[str, float]]:
-    """
-    :param path: CSV file written by :class:`ContinualMetrics`
-    :return: Its rows
-    """
-    with open(path, newline="") as file:
-        return [
-            {column: float(row[column]) if column == "mean_return" else int(row[column]) for column in COLUMNS}
-            for row in csv.DictReader(file)
-        ]

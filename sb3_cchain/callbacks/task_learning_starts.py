@@ -1,21 +1,24 @@
 """Random actions at the beginning of each task."""
 
+from typing import Any
+
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cchain.tasks.sync import require_continual
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks, step_task
 from sb3_cchain.validation import check_number
 
 
 class TaskLearningStarts(BaseCallback):
     """
     ``learning_starts`` of an off-policy algorithm at the beginning of each task: random actions and no updates, as in the
-    continual MinAtar experiments of the C-CHAIN paper. SB3 does so at the beginning of training alone.
+    continual MinAtar experiments of the C-CHAIN paper. SB3 does so only at the beginning of training.
 
     A switch in the middle of a rollout is followed from the next rollout on, up to ``train_freq - 1`` steps late.
 
-    All else goes on over a switch: replay buffer, exploration rate, optimiser. It is the one thing in that protocol
-    that needs to know of a switch.
+    Everything else goes on over a switch: replay buffer, exploration rate, optimiser. This is the only thing in that protocol
+    that needs to know of a switch. Give it after :class:`~sb3_cchain.TaskSync`, which puts the environment on the task that
+    is due when training is resumed.
 
     :param learning_starts: Environment steps at the beginning of each task, the first included. ``model.learning_starts`` is
         set to it, and at each switch to the time of the switch plus it.
@@ -34,18 +37,24 @@ class TaskLearningStarts(BaseCallback):
             raise TypeError(f"TaskLearningStarts is for off-policy algorithms, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        require_continual(self, self.training_env)
+        require_tasks(self)
         if self.num_timesteps == 0:
             self.model.learning_starts = self.learning_starts
-        self._task_id: int | None = None
+            self.model.learning_starts_task_id = None  # type: ignore[attr-defined]
+        self._switch = TaskSwitch(getattr(self.model, "learning_starts_task_id", None))
+        if self._switch.task_id is not None:
+            # Training may have been saved at a switch, before this callback heard of it
+            self._listen(episode_task(self.model))
 
     def _on_step(self) -> bool:
-        if self._task_id is None:
-            self._task_id = self.locals["infos"][0]["task_id"]
+        if self._switch.task_id is None:
+            self._listen(step_task(self.model, self.locals["infos"]))
+        # A switch ends an episode
         if self.locals["dones"].any():
-            # A switch ends an episode, and the vectorised environment has already begun the next one
-            task_id = self.training_env.get_attr("task_id", indices=0)[0]
-            if task_id != self._task_id:
-                self._task_id = task_id
-                self.model.learning_starts = self.num_timesteps + self.learning_starts
+            self._listen(episode_task(self.model))
         return True
+
+    def _listen(self, task_id: Any) -> None:
+        if self._switch.happened(task_id):
+            self.model.learning_starts = self.num_timesteps + self.learning_starts
+        self.model.learning_starts_task_id = task_id  # type: ignore[attr-defined]

@@ -4,7 +4,8 @@ from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.dm_control import ContinualDMControl, FlatDMControl
 from sb3_cchain.envs.gym_control import ContinualGymControl, ObservationOffset
 from sb3_cchain.envs.minatar import ChannelPadding, ContinualMinAtar, NoRewardLimit, PixelFrames, SeededStickyAction
-from sb3_cchain.envs.procgen import ContinualProcgen, ContinualProcgenVecEnv, ProcgenGame
+from sb3_cchain.envs.procgen import ContinualProcgen, ProcgenGame
+from sb3_cchain.envs.procgen_vec_env import ContinualProcgenVecEnv
 from sb3_cchain.envs.registration import register_envs
 from sb3_cchain.envs.reward_scale import RewardScale
 from sb3_cchain.envs.task_normalize import TaskVecNormalize

@@ -1,13 +1,12 @@
 """A sequence of tasks as one Gymnasium environment."""
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from itertools import accumulate
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType, RenderFrame
 
+from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.validation import check_list, check_number
 
 Task = str | Callable[..., gym.Env]
@@ -21,7 +20,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     ``reset()`` begins the next task. The last task goes on for ever.
 
     The agent sees neither the task nor the switch. For logging, ``info["task_id"]`` is the task that the step was made in,
-    and ``info["episode_return"]`` the return of the episode so far, before any wrapper touched the rewards.
+    ``info["task_reward"]`` its reward and ``info["episode_return"]`` the return of the episode so far, before any wrapper
+    touched the rewards.
 
     With several environments side by side steps are counted over all of them, so that they switch together:
     :class:`~sb3_cchain.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
@@ -35,6 +35,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     :param render_mode: As in :func:`gymnasium.make`
     :raises ValueError: For an empty task list, lengths that are not positive or not one per task, an unknown environment,
         or tasks whose spaces differ
+    :raises TypeError: When ``tasks`` is not a list of environment ids and callables, or a callable makes no environment
     :raises ImportError: When the package that a task needs is not installed
     """
 
@@ -52,27 +53,21 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     ):
         tasks = _check_tasks(tasks)
         self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks))
-        check_number("first_task", first_task, 0, len(tasks) - 1, integer=True)
-        self.tasks = [_make_task(task, render_mode) for task in tasks]
+        # The time of the sequence, and the task of the present episode
+        self.clock = TaskClock(self.steps_per_task, n_envs, first_task)
+        self.tasks = [_make_task(position, task, render_mode) for position, task in enumerate(tasks)]
         _check_spaces(self.tasks)
 
         self.observation_space = self.tasks[0].observation_space
         self.action_space = self.tasks[0].action_space
         self.metadata = self.tasks[0].metadata
         self.render_mode = render_mode
-
-        # Total steps at which each task ends; the last does not
-        self._task_ends = list(accumulate(self.steps_per_task))[:-1]
-        self._pinned = False
         self._seeded: set[int] = set()
-        self._first_step = [0, *self._task_ends][first_task]
-        self._task_id = first_task
-        self.set_clock(0, n_envs)
 
     @property
     def task_id(self) -> int:
         """The task of the present episode, counted from 0."""
-        return self._task_id
+        return self.clock.task_id
 
     @property
     def n_tasks(self) -> int:
@@ -82,22 +77,32 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     @property
     def task(self) -> gym.Env:
         """The environment of the present episode."""
-        return self.tasks[self._task_id]
+        return self.tasks[self.task_id]
 
-    def set_clock(self, total_steps: int, n_envs: int = 1) -> bool:
+    @property
+    def first_task(self) -> int:
+        """The task that the sequence begins with."""
+        return self.clock.first_task
+
+    @property
+    def task_sequence(self) -> list[Any]:
+        """
+        A description of each task. Two environments whose descriptions are equal have the same tasks. A subclass describes its
+        tasks by the arguments that tell them apart: by numbers, strings, lists or tuples, which can be compared and pickled.
+        """
+        return [_name(task) for task in self.tasks]
+
+    def set_clock(self, total_steps: int, n_envs: int | None = None) -> bool:
         """
         Say how far training is. The next ``reset()`` begins an episode of the task of that time.
 
         :param total_steps: Environment steps made so far, over all environments
-        :param n_envs: Environments that step together with this one, itself included
+        :param n_envs: Environments that step together with this one, itself included; None leaves their number as it is
         :return: Whether the present episode is of another task, so that a ``reset()`` is due
-        :raises ValueError: When ``total_steps`` is negative or ``n_envs`` not positive
+        :raises ValueError: When ``total_steps`` is negative or ``n_envs`` is not positive
         """
-        check_number("total_steps", total_steps, 0, integer=True)
-        check_number("n_envs", n_envs, 1, integer=True)
-        self._total_steps, self._n_envs = self._first_step + total_steps, n_envs
-        self._pinned = False
-        return self._due_task() != self._task_id
+        self.clock.set(total_steps, n_envs)
+        return self.clock.is_over
 
     def set_task(self, task_id: int) -> None:
         """
@@ -106,12 +111,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :param task_id: The task, counted from 0
         :raises ValueError: When there is no such task
         """
-        check_number("task_id", task_id, 0, self.n_tasks - 1, integer=True)
-        self._pinned = True
-        self._pinned_task = task_id
-
-    def _due_task(self) -> int:
-        return self._pinned_task if self._pinned else bisect_right(self._task_ends, self._total_steps)
+        self.clock.pin(task_id)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ObsType, dict[str, Any]]:
         """
@@ -122,16 +122,16 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :return: Observation and info
         """
         super().reset(seed=seed)
-        self._task_id = self._due_task()
+        self.clock.begin()
         if seed is not None:
-            self._seeded = {self._task_id}
-        elif self._task_id not in self._seeded:
-            # So that one seed determines the whole sequence
-            self._seeded.add(self._task_id)
+            self._seeded = {self.task_id}
+        elif self.task_id not in self._seeded:
+            # One seed determines the whole sequence
+            self._seeded.add(self.task_id)
             seed = int(self.np_random.integers(2**31))
         observation, info = self.task.reset(seed=seed, options=options)
         self._episode_return = 0.0
-        return observation, {**info, "task_id": self._task_id}
+        return observation, {**info, "task_id": self.task_id}
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """
@@ -141,11 +141,11 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :return: Observation, reward, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.task.step(action)
-        self._total_steps += self._n_envs
+        self.clock.advance()
         self._episode_return += float(reward)
-        truncated = truncated or (not self._pinned and self._due_task() != self._task_id)
-        info = {**info, "task_id": self._task_id, "episode_return": self._episode_return}
-        return observation, reward, terminated, truncated, info
+        truncated = truncated or self.clock.is_over
+        told = {"task_id": self.task_id, "task_reward": float(reward), "episode_return": self._episode_return}
+        return observation, reward, terminated, truncated, {**info, **told}
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:
         """
@@ -182,16 +182,19 @@ def _check_steps_per_task(steps_per_task: int | Sequence[int], n_tasks: int) -> 
     return [int(steps) for steps in steps_per_task]
 
 
-def _make_task(task: Task, render_mode: str | None) -> gym.Env:
+def _make_task(position: int, task: Task, render_mode: str | None) -> gym.Env:
     try:
         if isinstance(task, str):
             return gym.make(task, render_mode=render_mode)
-        return task() if render_mode is None else task(render_mode=render_mode)
+        env = task() if render_mode is None else task(render_mode=render_mode)
     except gym.error.UnregisteredEnv as error:
         # Gymnasium's message ends with the nearest names
         raise ValueError(f"Unknown environment {task!r} in `tasks`: {error}") from error
     except gym.error.DependencyNotInstalled as error:
         raise ImportError(f"Task {task!r} needs a package that is not installed: {error}") from error
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"`tasks[{position}]` must make a Gymnasium environment, but calling it returned {env!r}")
+    return env
 
 
 def _check_spaces(tasks: list[gym.Env]) -> None:

@@ -100,6 +100,11 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating]]
         makers = [partial(_make_task, domain, name) for name in self.task_names]
         super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
 
+    @property
+    def task_sequence(self) -> list[tuple[str, str]]:
+        """The domain and the name of each task."""
+        return [(self.domain, name) for name in self.task_names]
+
 
 def _known_tasks() -> dict[str, Sequence[str]]:
     try:

@@ -21,8 +21,8 @@ class ObservationOffset(gym.ObservationWrapper):
 
     :param env: Environment with ``Box`` observations
     :param offset: What to add, of the observations' shape
-    :raises TypeError: When the observations are not a ``Box``
-    :raises ValueError: When the offset's shape is not the observations'
+    :raises TypeError: When the observations are not a ``Box`` of floating-point numbers
+    :raises ValueError: When the offset is not an array of finite numbers, or its shape is not the observations'
     """
 
     def __init__(self, env: gym.Env, offset: ArrayLike):
@@ -30,9 +30,17 @@ class ObservationOffset(gym.ObservationWrapper):
         space = env.observation_space
         if not isinstance(space, spaces.Box):
             raise TypeError(f"An observation offset needs Box observations, got {space}")
-        self.offset = np.asarray(offset, dtype=space.dtype)
+        if not np.issubdtype(space.dtype, np.floating):
+            # The offset would be rounded, and the sum would overflow
+            raise TypeError(f"An observation offset needs Box observations of floating-point numbers, got {space}")
+        try:
+            self.offset = np.array(offset, dtype=space.dtype)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"`offset` must be an array of numbers, got {offset!r}") from error
         if self.offset.shape != space.shape:
             raise ValueError(f"`offset` must have the observations' shape {space.shape}, got {self.offset.shape}")
+        if not np.isfinite(self.offset).all():
+            raise ValueError(f"`offset` must be finite, got {offset!r}")
         self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)
 
     def observation(self, observation: NDArray) -> NDArray:
@@ -81,6 +89,7 @@ class ContinualGymControl(ContinualEnv):
         check_number("n_tasks", n_tasks, 1, integer=True)
         check_number("offset_std", offset_std, 0)
         check_number("offset_seed", offset_seed, 0, integer=True)
+        self.env_id = env_id
         shape = (n_tasks, *_observation_shape(env_id))
         if offsets is None:
             self.offsets = np.random.default_rng(offset_seed).normal(0.0, offset_std, shape).astype(np.float32)
@@ -89,6 +98,11 @@ class ContinualGymControl(ContinualEnv):
             self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
         super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+
+    @property
+    def task_sequence(self) -> list[tuple[str, list[float]]]:
+        """The environment and the offset of each task."""
+        return [(self.env_id, offset.tolist()) for offset in self.offsets]
 
 
 def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from gymnasium.wrappers import TransformReward
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
-from sb3_cchain.validation import check_list, check_number
+from sb3_cchain.validation import check_bool, check_list, check_number
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 
@@ -151,7 +151,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: As in :func:`gymnasium.make`
-    :raises TypeError: When ``games`` is a string, or no list
+    :raises TypeError: When ``games`` is a string or not a list, or ``difficulty_ramping`` is not a boolean
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When MinAtar is not installed
     """
@@ -170,9 +170,15 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     ):
         self.games = _check_games(games)
         check_number("sticky_action_prob", sticky_action_prob, 0, 1)
+        check_bool("difficulty_ramping", difficulty_ramping)
         settings = {"sticky_action_prob": sticky_action_prob, "difficulty_ramping": difficulty_ramping}
         tasks = [partial(_make_game, game, n_channels, **settings) for game in self.games]
         super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+
+    @property
+    def task_sequence(self) -> list[str]:
+        """The game of each task."""
+        return list(self.games)
 
 
 def _check_games(games: Sequence[str]) -> list[str]:

@@ -4,6 +4,8 @@ from typing import SupportsFloat
 
 import gymnasium as gym
 
+from sb3_cchain.validation import check_number
+
 
 class RewardScale(gym.RewardWrapper):
     """
@@ -12,10 +14,12 @@ class RewardScale(gym.RewardWrapper):
 
     :param env: The environment
     :param scale: The factor
+    :raises ValueError: When ``scale`` is not a finite number
     """
 
     def __init__(self, env: gym.Env, scale: float):
         super().__init__(env)
+        check_number("scale", scale)
         self.scale = scale
 
     def reward(self, reward: SupportsFloat) -> float:

@@ -9,6 +9,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
+from sb3_cchain.tasks.signal import TaskSwitch, first_reset_info
+from sb3_cchain.validation import check_bool
+
 Observation = NDArray | dict[str, NDArray]
 
 
@@ -39,6 +42,7 @@ class TaskVecNormalize(VecNormalize):
     :param epsilon: Added to variances
     :param norm_obs_keys: The parts of a ``Dict`` observation to normalise
     :param restart: Whether the statistics restart at a switch
+    :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward`` or ``restart`` is not a boolean
     """
 
     def __init__(
@@ -55,10 +59,13 @@ class TaskVecNormalize(VecNormalize):
         *,
         restart: bool = True,
     ):
+        flags = {"training": training, "norm_obs": norm_obs, "norm_reward": norm_reward, "restart": restart}
+        for name, flag in flags.items():
+            check_bool(name, flag)
         super().__init__(venv, training, norm_obs, norm_reward, clip_obs, clip_reward, gamma, epsilon, norm_obs_keys)
         self.restart = restart
-        # The task that the statistics are of; None before the first step, and for other environments always
-        self._statistics_task: int | None = None
+        # Knows the task that the statistics are of. None before the first step, and where tasks have no number
+        self._switch = TaskSwitch()
         self._before_reset: dict[str, Any] | None = None
 
     def reset(self) -> Observation:
@@ -73,7 +80,7 @@ class TaskVecNormalize(VecNormalize):
             if self._before_reset is not None:
                 self.__dict__.update(self._before_reset)
             # Without normalisation of observations there is no `obs_rms`
-            names = {"obs_rms", "ret_rms", "_statistics_task"}.intersection(self.__dict__)
+            names = {"obs_rms", "ret_rms", "_switch"}.intersection(self.__dict__)
             self._before_reset = {name: deepcopy(self.__dict__[name]) for name in names}
         observation = super().reset()
         if self._enters_task():
@@ -111,10 +118,8 @@ class TaskVecNormalize(VecNormalize):
     def _enters_task(self) -> bool:
         if not self._follows_tasks():
             return False
-        # Of the present episode: a vectorised environment resets by itself, and the info of the step is the old episode's
-        task = self.venv.unwrapped.reset_infos[0].get("task_id")
-        previous, self._statistics_task = self._statistics_task, task
-        return previous is not None and previous != task
+        # The vectorised environment has begun the next episode by itself; the info of the step is still that of the old one
+        return self._switch.happened(first_reset_info(self.venv).get("task_id"))
 
     def _restart(self) -> None:
         if self.norm_obs:
