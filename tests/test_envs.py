@@ -1,5 +1,6 @@
 """ContinualEnv and the registered environments."""
 
+import pickle
 import sys
 
 import gymnasium as gym
@@ -13,11 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
 from sb3_cchain.callbacks.continual import with_continual_callbacks
-from sb3_cchain.envs import ObservationOffset, RewardScale
+from sb3_cchain.envs import ObservationOffset, RewardScale, TaskVecNormalize
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 from tests.envs import CountEnv, RandomEnv
 
@@ -127,6 +128,7 @@ def test_render_modes():
             r"`steps_per_task` must be one number or one per task \(1\), got \[10, 10\]",
         ),
         ((["CartPole-v1", "CartPole-v1"], [10, 0]), ValueError, r"`steps_per_task\[1\]` .* got 0"),
+        ((["CartPole-v1", lambda: None], 10), TypeError, r"`tasks\[1\]` must make a Gymnasium environment, .* returned None"),
         ((["CartPol-v1"], 10), ValueError, "Unknown environment 'CartPol-v1' .*CartPole"),
         (
             (["CartPole-v1", "Acrobot-v1"], 10),
@@ -251,6 +253,13 @@ def test_offset_wrapper_refuses_what_it_cannot_shift():
         ObservationOffset(RandomEnv(spaces.Discrete(3)), 1.0)
     with pytest.raises(ValueError, match=r"`offset` must have the observations' shape \(4,\), got \(3,\)"):
         ObservationOffset(RandomEnv(), np.zeros(3))
+    with pytest.raises(TypeError, match="needs Box observations of floating-point numbers"):
+        ObservationOffset(RandomEnv(spaces.Box(0, 255, (2,), np.uint8)), np.zeros(2))
+    for offset in ([np.nan] * 4, [np.inf] * 4):
+        with pytest.raises(ValueError, match="`offset` must be finite"):
+            ObservationOffset(RandomEnv(), offset)
+    with pytest.raises(ValueError, match="`offset` must be an array of numbers, got 'far'"):
+        ObservationOffset(RandomEnv(), "far")
 
 
 def test_importing_form_of_the_id():
@@ -330,23 +339,103 @@ def test_evaluation_follows_the_task_being_trained(algorithm, nested):
     assert recorded.tasks == [(step, [(step - 1) // 48] * 2) for step in range(12, 145, 12)]
 
 
-@pytest.mark.parametrize("difference", [dict(n_tasks=3), dict(offset_seed=1)])
-def test_evaluation_on_other_tasks_is_refused(difference):
+@pytest.mark.parametrize(
+    "difference, message",
+    [
+        (dict(n_tasks=3), "it has 3 tasks instead of 2"),
+        (dict(offset_seed=1), r"task 1 differs: \('CartPole-v1', \[.*\]\) instead of"),
+    ],
+)
+def test_evaluation_on_other_tasks_is_refused(difference, message):
     env, eval_env = (gym.make("Continual/CartPole-v1", **{"n_tasks": 2, **kwargs}) for kwargs in ({}, difference))
-    name = "n_tasks" if "n_tasks" in difference else "offsets"
-    with pytest.raises(ValueError, match=f"must have the tasks of the training environment, but `{name}` differs"):
+    with pytest.raises(ValueError, match=f"must have the tasks of the training environment, but {message}"):
         CChainPPO("MlpPolicy", env, **SETTINGS).learn(16, callback=EvalCallback(Monitor(eval_env), verbose=0))
 
 
+def test_a_task_sequence_is_equal_in_another_process_and_differs_with_the_tasks():
+    made = [three_tasks(), ContinualEnv(["CartPole-v1"] * 2, 10), gym.make("Continual/Acrobot-v1").unwrapped]
+    made.append(gym.make("Continual/MinAtar-v0", games=["Breakout", "Freeway"]).unwrapped)
+    sequences = [env.task_sequence for env in made]
+    assert [len(sequence) for sequence in sequences] == [env.n_tasks for env in made]
+    assert [pickle.loads(pickle.dumps(sequence)) for sequence in sequences] == sequences
+    assert sequences[0] == ["CountEnv"] * 3 and sequences[1] == ["CartPole-v1"] * 2
+    assert gym.make("Continual/MinAtar-v0", games=["Freeway", "Breakout"]).unwrapped.task_sequence != sequences[3]
+
+
+@pytest.mark.parametrize(
+    "name, makers",
+    [
+        ("steps_per_task", [lambda: three_tasks(10), lambda: three_tasks(20)]),
+        ("first_task", [three_tasks, lambda: three_tasks(first_task=1)]),
+        ("task_sequence", [three_tasks, lambda: ContinualEnv([CountEnv] * 2, 10)]),
+    ],
+)
+def test_environments_side_by_side_must_agree(name, makers):
+    with pytest.raises(ValueError, match=f"must have the same `{name}`, .* but environment 0 has .* and environment 1 has"):
+        CChainPPO("MlpPolicy", DummyVecEnv(makers), **SETTINGS).learn(32)
+
+
 class HasTaskId(RandomEnv):
+    """Numbers tasks in a way of its own, although nobody may set its clock."""
+
     task_id = "of its own"
+    steps_per_task = 5
 
 
-@pytest.mark.parametrize("callback", [TaskSync, ContinualMetrics])
-def test_environments_that_are_not_continual(callback):
+def test_environments_that_are_not_continual():
     CChainPPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16)
-    with pytest.raises(TypeError, match=f"{callback.__name__} is for continual environments"):
-        PPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16, callback=callback())
+    with pytest.raises(TypeError, match="TaskSync is for continual environments"):
+        PPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16, callback=TaskSync())
+    named = TransformInfo(RandomEnv(), "kitchen")
+    CChainPPO("MlpPolicy", named, reset_churn_coef=True, **SETTINGS).learn(16)
+    with pytest.raises(TypeError, match="ContinualMetrics needs an integer as `info\\[\"task_id\"\\]`, got 'kitchen'"):
+        PPO("MlpPolicy", named, **SETTINGS).learn(16, callback=ContinualMetrics())
+
+
+class TransformInfo(gym.Wrapper):
+    """Puts a task into the infos."""
+
+    def __init__(self, env, task_id):
+        super().__init__(env)
+        self.task_id = task_id
+
+    def reset(self, **kwargs):
+        return self.env.reset(**kwargs)[0], {"task_id": self.task_id}
+
+    def step(self, action):
+        return *self.env.step(action)[:4], {"task_id": self.task_id}
+
+
+class ResetByHand(BaseCallback):
+    """Begins an episode in the middle of training, as users do it."""
+
+    def _on_step(self):
+        if self.num_timesteps == 20:
+            self.model._last_obs = self.training_env.reset()
+        return True
+
+
+def test_a_reset_by_hand_keeps_tasks_and_metrics():
+    record, env = RecordTasks(), TaskVecNormalize(make_vec_env(three_tasks, env_kwargs=dict(steps_per_task=48)))
+    model = CChainPPO("MlpPolicy", env, **SETTINGS).learn(80, callback=[record, ResetByHand()])
+    assert [record.tasks[step] for step in (1, 20, 21, 48, 49, 80)] == [[0]] * 4 + [[1]] * 2
+    assert env.obs_rms.count == pytest.approx(33, abs=1e-3)
+    # One reward a step, whatever episodes it falls in
+    assert model.logger.name_to_value["continual/reward_per_step"] == 1
+
+
+@pytest.mark.parametrize("normalise", [VecNormalize, TaskVecNormalize])
+def test_two_normalised_environments_after_each_other(normalise):
+    envs = [normalise(make_vec_env(three_tasks, env_kwargs=dict(steps_per_task=48))) for _ in range(2)]
+    model, record = CChainPPO("MlpPolicy", envs[0], **SETTINGS), RecordTasks()
+    model.learn(32)
+    statistics = envs[0].obs_rms.mean.copy()
+    model.set_env(envs[1])
+    model.learn(32, callback=record, reset_num_timesteps=False)
+    assert model.get_vec_normalize_env() is envs[1]
+    assert [record.tasks[step] for step in (33, 48, 49, 64)] == [[0], [0], [1], [1]]
+    assert np.array_equal(envs[0].obs_rms.mean, statistics)
+    assert envs[1].obs_rms.count > 16
 
 
 def test_callbacks_of_ones_own_kind_are_not_added_twice():
@@ -367,6 +456,19 @@ def test_reward_scale():
     env = RewardScale(CountEnv(), 0.05)
     env.reset()
     assert env.step(0)[1] == pytest.approx(0.05)
+    for scale in (float("nan"), float("inf"), "2", True, None):
+        with pytest.raises(ValueError, match="`scale` must be a number, got"):
+            RewardScale(CountEnv(), scale)
+
+
+@pytest.mark.parametrize("value", ["no", "False", 0, 1, None])
+def test_what_is_not_a_boolean_is_refused(value):
+    with pytest.raises(TypeError, match=f"`difficulty_ramping` must be True or False, got {value!r}"):
+        gym.make("Continual/MinAtar-v0", difficulty_ramping=value)
+    for name in ("restart", "training", "norm_obs", "norm_reward"):
+        with pytest.raises(TypeError, match=f"`{name}` must be True or False, got {value!r}"):
+            TaskVecNormalize(make_vec_env(CountEnv), **{name: value})
+    assert TaskVecNormalize(make_vec_env(CountEnv), restart=np.bool_(False)).restart == False  # noqa: E712
 
 
 def test_reset_of_the_coefficient_at_a_switch():

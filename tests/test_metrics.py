@@ -1,5 +1,8 @@
 """Continual metrics: what is logged, what is written, that nothing scales it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from stable_baselines3 import A2C, DQN, PPO
@@ -45,6 +48,7 @@ def test_by_hand(tmp_path):
     assert [row["task_id"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
     assert [row["n_switches"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
     assert [row["mean_return"] for row in spy.logged] == [8, 8, 16, 16, 24, 24]
+    assert [row["reward_per_step"] for row in spy.logged] == [1, 1, 2, 2, 3, 3]
     # J(T) so far: mean over the tasks
     assert [row["average_performance"] for row in spy.logged] == pytest.approx([8, 8, 12, 12, 16, 16])
     assert [spy.logged[2 * task + 1][f"average_task_{task}"] for task in range(3)] == [8, 16, 24]
@@ -85,9 +89,124 @@ def test_resumed_training_continues_the_file(tmp_path):
     loaded.learn(48, callback=[ContinualMetrics(path), spy], reset_num_timesteps=False)
     assert [row["timesteps"] for row in read_returns(path)] == [16, 32, 48, 64, 80, 96]
     assert spy.logged[-1]["average_performance"] == 16
+    assert [row["n_switches"] for row in spy.logged] == [1, 2, 2]
     # From 0 again it is a new file
     loaded.learn(16, callback=ContinualMetrics(path))
     assert [row["timesteps"] for row in read_returns(path)] == [16]
+    # and the old one is kept
+    assert [row["timesteps"] for row in read_returns(tmp_path / "returns.csv.1")] == [16, 32, 48, 64, 80, 96]
+    loaded.learn(16, callback=ContinualMetrics(path))
+    assert [row["timesteps"] for row in read_returns(tmp_path / "returns.csv.2")] == [16]
+
+
+HEADER = "timesteps,task_id,n_episodes,mean_return\r\n"
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("name,price\r\nscrews,3\r\n", "is not a file of returns: its first line must be .* got 'name,price"),
+        (HEADER + "16,0,2,8.0\r\n32,0,2,1", "is damaged: line 3 .* got '32,0,2,1'"),  # of 16.0
+        (HEADER + "16,0,2,8.0\r\n32,0", "is damaged: line 3"),
+        (HEADER + "16,zero,2,8.0\r\n", "is damaged: line 2"),
+    ],
+)
+def test_a_foreign_or_torn_file_is_refused_before_training(tmp_path, text, message):
+    path = tmp_path / "returns.csv"
+    with open(path, "w", newline="") as file:
+        file.write(text)
+    model = PPO("MlpPolicy", make_env(), **SETTINGS)
+    model.num_timesteps = 48  # resumed, without returns of its own
+    with pytest.raises(ValueError, match=message):
+        model.learn(16, callback=[TaskSync(), ContinualMetrics(path)], reset_num_timesteps=False)
+    assert model.num_timesteps == 48
+    assert path.read_bytes() == text.encode()
+
+
+def test_a_fresh_run_does_not_touch_a_foreign_file(tmp_path):
+    path = tmp_path / "shopping.csv"
+    path.write_text("name,price\nscrews,3\n")
+    with pytest.raises(ValueError, match="is not a file of returns"):
+        CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(16, callback=ContinualMetrics(path))
+    assert path.read_text() == "name,price\nscrews,3\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_two_processes_cannot_write_one_file(tmp_path):
+    path = tmp_path / "returns.csv"
+    code = (
+        "import sys, pathlib; from sb3_cchain.callbacks.returns_file import ReturnsFile;"
+        "file = ReturnsFile(pathlib.Path(sys.argv[1]), [], keep_old=True); print('open', flush=True); sys.stdin.read()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "open\n"
+    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)
+    with pytest.raises(ValueError, match=r"Another process is writing .*returns\.csv"):
+        model.learn(16, callback=ContinualMetrics(path))
+    process.communicate()
+    model.learn(16, callback=ContinualMetrics(path))  # it has ended
+    assert len(read_returns(path)) == 1
+
+
+class Interrupt(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == 20:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_the_file_of_interrupted_training_can_be_written_again(tmp_path):
+    model, metrics = CChainPPO("MlpPolicy", make_env(), **SETTINGS), ContinualMetrics(tmp_path / "returns.csv")
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(32, callback=[metrics, Interrupt()])
+    model.learn(32, callback=ContinualMetrics(metrics.path))
+    assert [row["timesteps"] for row in read_returns(metrics.path)] == [16, 32]
+
+
+# --- Episodes that never end ----------------------------------------------------------------------------------------------
+
+
+def never_ending(reward=1.0):
+    return CountEnv(length=10**9, reward=reward)
+
+
+def test_the_reward_per_step_is_the_return_of_a_task_without_ends(tmp_path):
+    """The middle task's episodes end."""
+    path = tmp_path / "returns.csv"
+    tasks = [never_ending, lambda: CountEnv(length=8, reward=2.0), lambda: never_ending(3.0)]
+    model, spy = CChainPPO("MlpPolicy", ContinualEnv(tasks, 32), **SETTINGS), Spy()
+    model.learn(80, callback=[ContinualMetrics(path), spy])
+    assert [row["reward_per_step"] for row in spy.logged] == [1, 1, 2, 2, 3]
+    finished = ["48,1,2,16.0", "64,1,2,16.0"]
+    assert path.read_text().splitlines()[1:] == ["32,0,0,1.0", *finished, "80,2,0,3.0"]
+    # A task that goes on has one row
+    model.save(tmp_path / "model")
+    loaded = CChainPPO.load(tmp_path / "model", env=ContinualEnv(tasks, 32), device="cpu")
+    loaded.learn(16, callback=ContinualMetrics(path), reset_num_timesteps=False)
+    assert path.read_text().splitlines()[1:] == ["32,0,0,1.0", *finished, "96,2,0,3.0"]
+
+
+def test_an_episode_that_a_switch_cuts_counts_where_others_ended(tmp_path):
+    path = tmp_path / "returns.csv"
+    env = ContinualEnv([lambda: CountEnv(length=10)] * 2, 16)
+    CChainPPO("MlpPolicy", env, **SETTINGS).learn(16, callback=ContinualMetrics(path))
+    assert path.read_text().splitlines()[1:] == ["16,0,2,8.0"]  # of 10 and 6
+
+
+def test_one_environment_after_the_other(tmp_path):
+    path, spy = tmp_path / "returns.csv", Spy()
+    worlds = [never_ending(), CountEnv(length=8, reward=2.0), VecNormalize(make_vec_env(never_ending))]
+    model = PPO("MlpPolicy", worlds[0], **SETTINGS)
+    for world in worlds:
+        model.set_env(world)
+        for _ in range(2):
+            model.learn(16, callback=[ContinualMetrics(path), spy], reset_num_timesteps=False)
+    assert [row["task_id"] for row in spy.logged] == [row["n_switches"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
+    assert [row["reward_per_step"] for row in spy.logged] == [1, 1, 2, 2, 1, 1]
+    rows = ["32,0,0,1.0", "48,1,2,16.0", "64,1,2,16.0", "96,2,0,1.0"]
+    assert path.read_text().splitlines()[1:] == rows
 
 
 @pytest.mark.parametrize("algorithm, kwargs", [(A2C, dict(n_steps=16)), (DQN, dict(learning_starts=1000))])
@@ -112,7 +231,7 @@ def test_history_goes_on_over_several_calls_of_learn(tmp_path, monkeypatch):
     for _ in range(3):
         model.learn(32, callback=spy, reset_num_timesteps=False)
     assert [row["average_performance"] for row in spy.logged] == [8, 8, 12, 12, 16, 16]
-    assert [row["n_switches"] for row in spy.logged] == [0] * 6  # in this call of learn()
+    assert [row["n_switches"] for row in spy.logged] == [0, 0, 1, 1, 2, 2]
     assert not list(tmp_path.rglob("returns.csv"))
     model.save(tmp_path / "model")
     assert CChainPPO.load(tmp_path / "model", device="cpu").continual_returns == model.continual_returns

@@ -99,7 +99,7 @@ def test_games_are_minatars_own_and_switch_in_time(settings):
             episode_return += expected_reward
             assert type(reward) is float and (reward, terminated) == (expected_reward, done)
             assert truncated == (step == length and task_id < 5)
-            assert info == {"task_id": task_id, "episode_return": episode_return}
+            assert info == {"task_id": task_id, "task_reward": reward, "episode_return": episode_return}
             if terminated or truncated:
                 observation, _ = env.reset()
                 expected, episode_return = reference.reset(), 0

@@ -135,6 +135,33 @@ def test_training_that_begins_anew_keeps_the_network():
     assert all(th.equal(trained[name], tensor) for name, tensor in spy.seen[0]["parameters"].items())
 
 
+@pytest.mark.parametrize("name", ["PPO", "CChainPPO", "CChainDQN"])
+def test_one_environment_after_the_other(name):
+    """Each environment that set_env() gives is a task; the same one again is not."""
+    worlds, n_resets, starts = [CountEnv(), CountEnv(1), CountEnv(2)], [], []
+    model = make_model(name, env=worlds[0])
+    for world in (worlds[0], worlds[0], worlds[1], worlds[1], worlds[2]):
+        oracle, spy = Oracle(), Spy()
+        model.set_env(world)
+        model.learn(16, callback=[oracle, spy], reset_num_timesteps=False)
+        n_resets.append(oracle.n_resets)
+        starts.append(spy.seen[0]["n_moments"] == 0)
+    assert n_resets == [0, 0, 1, 0, 1]
+    assert starts == [True, False, True, False, True]
+
+
+def test_a_loaded_model_goes_on_in_its_environment(tmp_path):
+    model = make_model("PPO", env=CountEnv())
+    model.learn(16, callback=Oracle(), reset_num_timesteps=False)
+    model.save(tmp_path / "model")
+    loaded, oracle = type(model).load(tmp_path / "model", env=CountEnv(), device="cpu"), Oracle()
+    loaded.learn(16, callback=oracle, reset_num_timesteps=False)
+    assert oracle.n_resets == 0
+    loaded.set_env(CountEnv(1))
+    loaded.learn(16, callback=oracle, reset_num_timesteps=False)
+    assert oracle.n_resets == 1
+
+
 def test_c_chain_forgets():
     model = make_model("CChainPPO", churn_warmup=1)
     seen = []

@@ -299,7 +299,7 @@ def test_switches_in_time_with_procgens_own_episodes():
             episode_return += expected_reward
             assert (reward, terminated) == (expected_reward, done)
             assert truncated == (step == length and task_id < 2)
-            assert info == {"task_id": task_id, "episode_return": episode_return}
+            assert info == {"task_id": task_id, "task_reward": reward, "episode_return": episode_return}
             # A switch ends no episode of procgen's, so there the observation is the true one
             assert np.array_equal(observation, before if done else expected)
             if terminated or truncated:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain import CChainDQN, ContinualEnv
@@ -66,6 +66,34 @@ def test_resumed_in_a_new_environment(tmp_path, n_before, rest):
     model = SpyDQN.load(tmp_path / "model", env=make_env(), device="cpu")
     model.learn(300 - n_before, callback=TaskLearningStarts(20), reset_num_timesteps=False)
     assert model.acted == [*rest, *range(120, 200), *range(220, 300)]
+
+
+class SaveAt(BaseCallback):
+    """Saves as a checkpoint does that comes before the others hear of the step."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.path = path
+
+    def _on_step(self):
+        if self.num_timesteps == 100:
+            self.model.save(self.path)
+        return True
+
+
+def test_saved_at_a_switch_before_the_callback_heard_of_it(tmp_path):
+    make_model(make_env()).learn(110, callback=[SaveAt(tmp_path / "model"), TaskLearningStarts(20)])
+    model = SpyDQN.load(tmp_path / "model", env=make_env(), device="cpu")
+    model.learn(100, callback=TaskLearningStarts(20), reset_num_timesteps=False)
+    assert model.acted[0] == 120
+
+
+def test_one_environment_after_the_other():
+    model = make_model(CountEnv())
+    for _ in range(2):
+        model.set_env(CountEnv())
+        model.learn(50, callback=TaskLearningStarts(20), reset_num_timesteps=False)
+    assert model.acted == [*range(20, 50), *range(70, 100)]
 
 
 def test_another_learn_begins_again():

@@ -74,12 +74,13 @@ class ContinualMetrics(BaseCallback):
         past = [] if is_new else getattr(self.model, "continual_returns", [])
         if not past and not is_new and path is not None and path.exists():
             past = read_returns(path)
-        # Rows of training that was lost after the last save will come again. The row of an endless task that goes on, too.
+        # Rows of training that was lost after the last save will come again, and so will the row of a task that goes on and
+        # in which no episode has ended yet
+        goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
         self.rows = [
             row
             for row in past
-            if row["timesteps"] <= self.num_timesteps
-            and not (row["n_episodes"] == 0 and row["task_id"] == state["task_id"] and state["n_steps"] > 0)
+            if row["timesteps"] <= self.num_timesteps and not (goes_on and row["task_id"] == state["task_id"])
         ]
         self.model.continual_returns = self.rows  # type: ignore[attr-defined]
         self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new)

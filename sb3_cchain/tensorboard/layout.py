@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # TensorBoard need not be installed
 LAYOUT: dict[str, dict[str, str]] = {
     "Returns": {
         "Mean return on the task being trained": "continual/mean_return",
+        "Reward per step on the task being trained": "continual/reward_per_step",
         "Average return of each task": r"continual/average_task_\d+",
         "Average performance over the tasks so far": "continual/average_performance",
         "Task being trained": "continual/task_id",

@@ -1,0 +1,78 @@
+"""The clock that says which task is due, and the signal that it has switched."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_cchain import CChainCallback, CChainPPO
+from sb3_cchain.tasks.clock import TaskClock
+from sb3_cchain.tasks.signal import TaskSwitch
+from tests.envs import CountEnv
+
+SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=1, device="cpu", seed=0)
+
+
+def test_the_clock_counts_the_steps_of_all_environments():
+    clock, due = TaskClock([4, 2, 4], n_envs=2), []
+    for _ in range(5):
+        due.append(clock.due_task)
+        clock.advance()
+    assert due == [0, 0, 1, 2, 2]
+    assert clock.due_task == 2  # the last task goes on
+    assert clock.task_id == 0 and clock.is_over
+    assert clock.begin() and clock.task_id == 2
+    assert not clock.is_over and not clock.begin()
+
+
+def test_the_clock_begins_with_the_first_task():
+    clock = TaskClock([4, 2, 4], first_task=1)
+    assert (clock.task_id, clock.due_task, clock.first_task) == (1, 1, 1)
+    clock.set(2)
+    assert clock.due_task == 2
+
+
+def test_a_pinned_clock_stays_until_it_is_set():
+    clock = TaskClock([4, 4])
+    clock.pin(1)
+    assert clock.due_task == 1 and not clock.is_over
+    clock.set(0)
+    assert clock.due_task == 0
+
+
+def test_setting_the_time_keeps_the_number_of_environments():
+    clock = TaskClock([4, 4], n_envs=4)
+    clock.set(0)
+    clock.advance()
+    assert clock.due_task == 1
+
+
+@pytest.mark.parametrize(
+    "first, second, switched", [(0, 0, False), (0, 1, True), ("a", "a", False), ("a", "b", True), (None, 3, False)]
+)
+def test_a_listener_hears_of_a_switch_once(first, second, switched):
+    switch = TaskSwitch(first)
+    assert switch.happened(second) == switched
+    assert not switch.happened(second)
+
+
+def test_tasks_may_be_numbered_by_arrays():
+    switch = TaskSwitch(np.array([1, 0]))
+    assert not switch.happened(np.array([1, 0]))
+    assert switch.happened(np.array([0, 1]))
+
+
+@pytest.mark.parametrize("as_callback", [False, True])
+@pytest.mark.parametrize("reset", [False, True])
+def test_another_environment_resets_the_coefficient(as_callback, reset):
+    arguments = dict(churn_warmup=0, reset_churn_coef=reset)
+    if as_callback:
+        callback = CChainCallback(**arguments)
+        model = PPO("MlpPolicy", CountEnv(), **SETTINGS)
+    else:
+        callback, model = None, CChainPPO("MlpPolicy", CountEnv(), **arguments, **SETTINGS)
+    worlds, n_seen = [CountEnv(), CountEnv(1)], []
+    for world in (worlds[0], worlds[0], worlds[1]):
+        model.set_env(world)
+        model.learn(32, callback=callback, reset_num_timesteps=False)
+        n_seen.append(int((callback or model).churn_reducer.coefficient.n_seen))
+    assert n_seen == [2, 4, 2 if reset else 6]
