@@ -301,6 +301,29 @@ def test_no_files_without_a_folder_of_logs(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["ntk_24.png"]
 
 
+def no_space_left(*args, **kwargs):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("reason", ["No space left on device", "File exists"])
+def test_a_picture_that_cannot_be_written_does_not_end_training(tmp_path, monkeypatch, reason):
+    folder = tmp_path / "pictures"
+    model, callback = make_ppo("discrete"), NTKCallback(n_minibatches=4, picture_interval=1, path=folder)
+    if reason == "File exists":
+        folder.touch()
+    else:
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", no_space_left)
+    with pytest.warns(UserWarning, match=rf"could not write .*ntk_24\.png .*{reason}.* Training goes on"):
+        model.learn(24, callback=callback, log_interval=100)
+    assert {"ntk/matrix", "ntk/srank"} <= set(model.logger.name_to_value)
+
+
+def test_the_folder_of_pictures_is_no_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"`path` must be a folder, got '.*file', which is a file"):
+        NTKCallback(path=tmp_path / "file")
+
+
 @pytest.mark.parametrize("argument, value", [("n_minibatches", 1), ("delta", 1.5), ("interval", 0), ("picture_interval", -1)])
 def test_bad_arguments(argument, value):
     with pytest.raises(ValueError, match=f"`{argument}` must be .*got {value}"):

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from matplotlib import style
-from matplotlib.figure import Figure
 from rich.table import Table
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,14 +22,21 @@ from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.health import trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
-from sb3_cchain.analysis.ntk_callback import draw_ntk
+from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.sync import is_continual
 from sb3_cchain.validation import check_number
 
-# What there is of each group of layers, by the name after "health/"
-OF_GROUPS = ("dormant_share", "active_share", "feature_srank", "feature_effective_rank", "weight_norm", "distance_from_init")
+# Drawn for each group of layers, by their names after "health/"
+GROUP_FIGURES = (
+    "dormant_share",
+    "active_share",
+    "feature_srank",
+    "feature_effective_rank",
+    "weight_norm",
+    "distance_from_init",
+)
 
 # Iterations or episodes until the logger is emptied
 _NEVER = 10**9
@@ -208,39 +213,22 @@ def _table(title: str, inspections: Sequence[Inspection], rows: dict[str, str]) 
 
 def plot(inspections: Sequence[Inspection], path: Path) -> None:
     """
-    Draw the NTKs, and what there is of each group of layers.
+    Draw the NTKs, and the figures of each group of layers.
 
     :param inspections: Of one model, or of two to compare
     :param path: PNG file
+    :raises ImportError: Without matplotlib
     """
-    groups = list(dict.fromkeys(_group(t) for t in _tags(inspections, "health/") if t.count("/") > 1))
-    bars = [name for name in OF_GROUPS if any(tag.startswith(f"health/{name}/") for tag in _tags(inspections, "health/"))]
-    with style.context("default"):  # RL Zoo's plots leave seaborn's behind
-        figure = _figure(inspections, groups, bars)
+    tags = [tag for tag in _tags(inspections, "health/") if tag.count("/") > 1]
+    groups = list(dict.fromkeys(map(_group, tags)))
+    bars = {
+        name.replace("_", " ").replace("feature ", "feature\n"): [
+            [inspection.figures.get(f"health/{name}/{group}", np.nan) for group in groups] for inspection in inspections
+        ]
+        for name in GROUP_FIGURES
+        if any(tag.startswith(f"health/{name}/") for tag in tags)
+    }
+    ntks = [(i.ntk, f"{i.name}: NTK, srank {i.figures['ntk/srank']:.0f}") for i in inspections]
+    figure = plot_models([inspection.name for inspection in inspections], ntks, groups, bars)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
-
-
-def _figure(inspections: Sequence[Inspection], groups: list[str], bars: list[str]) -> Figure:
-    figure = Figure(figsize=(11, 4.4 + 0.3 * len(groups) * len(inspections) + 1.2), dpi=100, layout="constrained")
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.4, 1.2 + 0.3 * len(groups) * len(inspections)]).flat
-    for axes, inspection in zip(above.subplots(1, 2).flat, [*inspections, None][:2], strict=True):
-        if inspection is None:
-            axes.axis("off")
-            continue
-        srank = inspection.figures["ntk/srank"]
-        image = draw_ntk(axes, inspection.ntk, f"{inspection.name}: NTK, srank {srank:.0f}")
-        above.colorbar(image, ax=axes, extend="both", label="inner product of gradients")
-    for axes, name in zip(below.subplots(1, len(bars), sharey=True, squeeze=False).flat, bars, strict=True):
-        height = 0.8 / len(inspections)
-        for i, inspection in enumerate(inspections):
-            values = [inspection.figures.get(f"health/{name}/{group}", np.nan) for group in groups]
-            axes.barh(np.arange(len(groups)) + i * height, values, height, label=inspection.name)
-        axes.set_yticks(np.arange(len(groups)) + height * (len(inspections) - 1) / 2, groups)
-        axes.set_title(name.replace("_", " ").replace("feature ", "feature\n"), fontsize=10)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.margins(x=0.1)
-    axes.invert_yaxis()
-    if len(inspections) > 1:
-        below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
-    return figure

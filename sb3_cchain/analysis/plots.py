@@ -1,0 +1,98 @@
+"""The pictures of analysis. They import matplotlib when they are drawn, as the rest of the package works without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+
+def import_matplotlib() -> ModuleType:
+    """
+    :return: The module ``matplotlib``, with its modules ``figure`` and ``style``
+    :raises ImportError: When it cannot be imported, with the command that installs it
+    """
+    try:
+        import matplotlib.figure
+        import matplotlib.style
+    except ImportError as error:
+        raise ImportError(f'Pictures need matplotlib ({error}): pip install "sb3-cchain[plots]"') from error
+    return matplotlib
+
+
+def plot_ntk(matrix: th.Tensor, title: str) -> Figure:
+    """
+    :param matrix: An NTK
+    :param title: Title
+    :return: A picture of the matrix
+    :raises ImportError: Without matplotlib
+    """
+    matplotlib = import_matplotlib()
+    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
+        figure: Figure = matplotlib.figure.Figure(figsize=(4.6, 4), dpi=100, layout="constrained")
+        figure.colorbar(draw_ntk(figure.add_subplot(), matrix, title), extend="both", label="inner product of gradients")
+    return figure
+
+
+def draw_ntk(axes: Axes, matrix: th.Tensor, title: str) -> AxesImage:
+    """
+    Red above 0, blue below, white 0. The 1 % of entries with the greatest absolute values lie beyond the ends of the colours;
+    otherwise a few of them would leave everything else white.
+
+    :param axes: Where to draw
+    :param matrix: An NTK
+    :param title: Title
+    :return: The image
+    """
+    limit = np.quantile(matrix.abs().cpu().numpy(), 0.99)
+    axes.set(title=title, xlabel="minibatch", ylabel="minibatch")
+    return axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+
+
+def plot_models(
+    names: Sequence[str],
+    ntks: Sequence[tuple[th.Tensor, str]],
+    groups: Sequence[str],
+    bars: Mapping[str, Sequence[Sequence[float]]],
+) -> Figure:
+    """
+    Draw the NTKs of one model or two, and bars for each group of their layers.
+
+    :param names: Names of the models
+    :param ntks: For each model its NTK and the title of that picture
+    :param groups: Names of the groups of layers
+    :param bars: By title, for each model a value of each group; not a number where there is none
+    :return: The picture
+    :raises ImportError: Without matplotlib
+    """
+    matplotlib = import_matplotlib()
+    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
+        heights = [4.4, 1.2 + 0.3 * len(groups) * len(names)]
+        figure: Figure = matplotlib.figure.Figure(figsize=(11, sum(heights)), dpi=100, layout="constrained")
+        above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights).flat
+        for axes, ntk in zip(above.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
+            if ntk is None:
+                axes.axis("off")
+            else:
+                above.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
+        height = 0.8 / len(names)
+        all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False).flat
+        for axes, (title, values) in zip(all_axes, bars.items(), strict=True):
+            for i, (name, lengths) in enumerate(zip(names, values, strict=True)):
+                axes.barh(np.arange(len(groups)) + i * height, lengths, height, label=name)
+            axes.set_yticks(np.arange(len(groups)) + height * (len(names) - 1) / 2, groups)
+            axes.set_title(title, fontsize=10)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.margins(x=0.1)
+        axes.invert_yaxis()
+        if len(names) > 1:
+            below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
