@@ -1,42 +1,163 @@
-"""Training that was interrupted leaves nothing behind that goes on looking."""
+"""After interrupted training no callback goes on acting, neither in training without it nor in that of another model."""
+
+import inspect
+import types
 
 import pytest
+import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain import ChurnMonitor
+import sb3_cchain
+from sb3_cchain import ChurnMonitor, TaskSync, analysis, callbacks, methods
 from sb3_cchain.analysis import NetworkHealth
+from sb3_cchain.networks.model_optimizers import model_optimizers
+from tests.method_models import go_on, make_env, make_model
+
+# Where the defaults would do little within a few updates
+ARGUMENTS = {
+    "ChurnMonitor": dict(interval=1),
+    "NetworkHealth": dict(interval=1),
+    "NTKCallback": dict(n_minibatches=4, interval=1, picture_interval=0),
+    "ReDo": dict(tau=0.5, interval=1),
+    "ShrinkAndPerturb": dict(shrink=0.5),
+    "TaskLearningStarts": dict(learning_starts=4),
+}
+PUBLIC = {
+    name: getattr(module, name)
+    for module in (sb3_cchain, methods, analysis, callbacks)
+    for name in module.__all__
+    if inspect.isclass(getattr(module, name)) and issubclass(getattr(module, name), BaseCallback)
+}
 
 
-def interrupt(model, callback):
-    """Ctrl-C in the second update of training."""
-    step = model.policy.optimizer.step
+def make_callback(name):
+    return PUBLIC[name](**ARGUMENTS.get(name, {}))
+
+
+class Interruption(BaseCallback):
+    """As an error of the environment or Ctrl-C in one of its steps."""
+
+    def _on_step(self):
+        if self.n_calls == 40:
+            raise KeyboardInterrupt
+        return True
+
+
+def interrupt_update(model):
+    """Ctrl-C in the fourth update."""
+    step, n_updates = model.policy.optimizer.step, 0
 
     def interrupted(*args, **kwargs):
-        if model.policy.optimizer.state:
+        nonlocal n_updates
+        n_updates += 1
+        if n_updates == 4:
+            model.policy.optimizer.step = step
             raise KeyboardInterrupt
         return step(*args, **kwargs)
 
     model.policy.optimizer.step = interrupted
+
+
+def attached(model):
+    """Hooks, and methods that were replaced."""
+    optimizers = model_optimizers(model).values()
+    hooks = [
+        hook for o in optimizers for hooks in (o._optimizer_step_pre_hooks, o._optimizer_step_post_hooks) for hook in hooks
+    ]
+    hooks += [hook for m in model.policy.modules() for hook in (*m._forward_hooks.values(), *m._forward_pre_hooks.values())]
+    owners = (model, model.policy, model.env, getattr(model, "rollout_buffer", None))
+    functions = (types.FunctionType, types.MethodType)
+    return hooks + [name for o in owners if o for name, value in vars(o).items() if isinstance(value, functions)]
+
+
+@pytest.mark.parametrize("where", ["update", "step"])
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_training_without_the_callback_is_plain_training(tmp_path, name, algorithm, where):
+    settings = dict(normalize_advantage=False) if algorithm == "PPO" else {}
+    model = make_model(algorithm, policy_kwargs=dict(net_arch=[8], optimizer_class=methods.L2Init), **settings)
+    before = attached(model)
+    interruption = [Interruption()] if where == "step" else []
+    if where == "update":
+        interrupt_update(model)
+    try:
+        model.learn(64, callback=[TaskSync(), make_callback(name), *interruption])
+    except KeyboardInterrupt:
+        pass
+    except (TypeError, AssertionError):
+        pytest.skip(f"{name} is not for {algorithm}")
+    else:
+        pytest.fail("nothing was interrupted")
+    model.save(tmp_path / "model")
+    plain = type(model).load(tmp_path / "model", env=make_env(), device="cpu")
+    if algorithm == "DQN":
+        model.save_replay_buffer(tmp_path / "buffer")
+        plain.load_replay_buffer(tmp_path / "buffer")
+    for each in (model, plain):
+        each.env.env_method("set_clock", 0, 1)  # the environments then reset alike
+        go_on(each, callback=TaskSync())
+    for parameter, other in zip(model.policy.parameters(), plain.policy.parameters(), strict=True):
+        assert th.equal(parameter, other)
+    assert attached(model) == before
+
+
+def test_when_training_begins_anew_and_reaches_the_same_step():
+    """Where the number of steps alone does not tell the trainings apart."""
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, n_epochs=1, seed=0, device="cpu")
+    monitors = [NetworkHealth(interval=1), ChurnMonitor(interval=1), shrink := methods.ShrinkAndPerturb(0.5)]
+    step = model.policy.optimizer.step
+
+    def interrupted(*args, **kwargs):
+        step(*args, **kwargs)
+        raise KeyboardInterrupt
+
+    model.policy.optimizer.step = interrupted
     with pytest.raises(KeyboardInterrupt):
-        model.learn(64, callback=callback)
+        model.learn(32, callback=monitors)
     model.policy.optimizer.step = step
-
-
-@pytest.mark.parametrize("monitor, prefix", [(ChurnMonitor, "churn_monitor/"), (NetworkHealth, "health/")])
-def test_training_without_the_monitor_is_not_watched(monitor, prefix):
-    model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
-    interrupt(model, monitor(interval=1))
-    assert model.policy.optimizer._optimizer_step_pre_hooks
+    assert model.num_timesteps == 32 and shrink.n_steps == 1
     model.logger.name_to_value.clear()
-    model.learn(64, reset_num_timesteps=False)
-    assert not model.policy.optimizer._optimizer_step_pre_hooks
-    assert not any(key.startswith(prefix) for key in model.logger.name_to_value)
+    model.learn(32)
+    assert shrink.n_steps == 1
+    assert not any(key.startswith(("health/", "churn_monitor/")) for key in model.logger.name_to_value)
+    assert attached(model) == []
+
+
+def test_a_new_callback_acts_once():
+    model = make_model("PPO")
+    interrupt_update(model)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, callback=(first := methods.ShrinkAndPerturb(0.5)))
+    n_steps = first.n_steps
+    model.learn(16, callback=(second := methods.ShrinkAndPerturb(0.5)))
+    assert (first.n_steps, second.n_steps) == (n_steps, 4)
+
+
+def test_arguments_are_of_callbacks():
+    assert ARGUMENTS.keys() <= PUBLIC.keys()
+
+
+def test_ars_is_not_watched_after_an_interruption():
+    """Whose observations the monitor sees in the environment's ``step_wait``."""
+    contrib = pytest.importorskip("sb3_contrib")
+    model, monitor = contrib.ARS("LinearPolicy", "CartPole-v1", n_delta=2, seed=0, device="cpu"), ChurnMonitor()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(200, callback=[monitor, Interruption()])
+    seen = len(monitor._observations)
+    assert "step_wait" in vars(model.env) and seen > 0
+    model.learn(200)
+    assert "step_wait" not in vars(model.env) and len(monitor._observations) == seen
 
 
 def test_a_monitor_goes_on_with_another_model():
     """Whose observations have another shape."""
     monitor = ChurnMonitor(interval=1)
-    interrupt(PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu"), monitor)
+    first = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
+    interrupt_update(first)
+    with pytest.raises(KeyboardInterrupt):
+        first.learn(64, callback=monitor)
     model = PPO("MlpPolicy", "MountainCar-v0", n_steps=32, batch_size=16, seed=0, device="cpu")
     model.learn(32, callback=monitor)
     assert "churn_monitor/fixed/policy_churn" in model.logger.name_to_value
+    assert attached(first) == []

@@ -1,7 +1,6 @@
 """How much the updates change the network's outputs where they were not meant to."""
 
 from collections import deque
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.analysis.metrics.churn import churn
 from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
 from sb3_cchain.analysis.random_state import unchanged_random_state
-from sb3_cchain.analysis.reference_batch import map_batch, recent_observations, sample_batch
+from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
@@ -88,17 +88,16 @@ class ChurnMonitor(BaseCallback):
         # Of the window that is open: by name the batch and the outputs at the beginning, and the updates to come
         self._window: dict[str, tuple[Batch, ModelOutputs]] = {}
         self._n_missing = 0
-        # What is attached to the model until the next rollout starts or ends
-        self._attached = ExitStack()
+        # On the model until the next rollout starts or ends
+        self._hooks = TrainingHooks()
         self._observations: deque[np.ndarray] = deque()
 
     def _init_callback(self) -> None:
         find_outputs(self.model)
 
     def _on_training_start(self) -> None:
-        # Of training that was interrupted, maybe of another model
-        self._attached.close()
-        self._window = {}
+        self._hooks.begin(self.model)
+        self._window = {}  # may be left from training that was interrupted
         add_overview(self.model)
         if self.locals.get("async_eval") is not None:
             raise ValueError("ChurnMonitor does not see the observations of ARS with `async_eval`: set it to None")
@@ -107,31 +106,29 @@ class ChurnMonitor(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        self._attached.close()
+        self._hooks.remove()
         optimizer = _leading_optimizer(self.model)
         if optimizer is None:
             self._open_window(0)
         else:
             # For train() alone
-            self._attached.callback(optimizer.register_step_pre_hook(self._before_update).remove)
+            self._hooks.before_step(optimizer, self._before_update)
 
     def _on_rollout_start(self) -> None:
         # train() is over
-        self._attached.close()
+        self._hooks.remove()
         self._close_window_if_over()
         if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
-            self._observations = self._attached.enter_context(recent_observations(self.training_env, self.batch_size))
+            # Algorithms that keep no observations (ARS)
+            self._observations = deque(maxlen=self.batch_size)
+            self._hooks.after_call(self.training_env, "step_wait", lambda step: self._observations.extend(np.array(step[0])))
 
     def _on_training_end(self) -> None:
-        self._attached.close()
+        self._hooks.remove()
         self._close_window_if_over()
         self._window = {}
 
-    def _before_update(self, *_: Any) -> None:
-        if self.num_timesteps != self.model.num_timesteps:
-            # Left behind by training that was interrupted, in training without this callback
-            self._attached.close()
-            return
+    def _before_update(self, optimizer: th.optim.Optimizer) -> None:
         self._close_window_if_over()
         if self._n_updates_seen % self.interval == 0:
             self._open_window(self.n_updates)

@@ -1,7 +1,5 @@
 """Logs how healthy a model's networks are while it learns."""
 
-from typing import Any
-
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -10,6 +8,7 @@ from sb3_cchain.analysis.health import network_health, remember_initial_paramete
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.validation import check_number
 
@@ -56,14 +55,13 @@ class NetworkHealth(TrainingInterval):
     :raises TypeError: When training starts, for an algorithm that is neither on-policy nor off-policy (ARS)
     """
 
-    _hooks: tuple[th.utils.hooks.RemovableHandle, ...] = ()
-
     def __init__(self, interval: int | None = None, batch_size: int = 256, tau: float = 0.025):
         super().__init__(interval, default_on_policy=10, default_off_policy=1000)
         check_number("batch_size", batch_size, 1, integer=True)
         check_number("tau", tau, 0)
         self.batch_size = batch_size
         self.tau = tau
+        self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
@@ -71,24 +69,17 @@ class NetworkHealth(TrainingInterval):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._on_training_end()  # of training that was interrupted
+        self._hooks.begin(self.model)
         remember_initial_parameters(self.model)
         self._gradient_norms: dict[th.Tensor, th.Tensor] = {}
         # After train(), gradients are not what they were at the step: SAC's actor loss adds its own to the critic's
-        self._hooks = tuple(
-            optimizer.register_step_pre_hook(self._before_step) for optimizer in model_optimizers(self.model).values()
-        )
+        for optimizer in model_optimizers(self.model).values():
+            self._hooks.before_step(optimizer, self._before_step)
 
     def _on_training_end(self) -> None:
-        for hook in self._hooks:
-            hook.remove()
-        self._hooks = ()
+        self._hooks.remove()
 
-    def _before_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        if self.num_timesteps != self.model.num_timesteps:
-            # Left behind by training that was interrupted, in training without this callback
-            self._on_training_end()
-            return
+    def _before_step(self, optimizer: th.optim.Optimizer) -> None:
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:

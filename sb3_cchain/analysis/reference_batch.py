@@ -1,8 +1,6 @@
 """Data of the training under way, to look at a model on."""
 
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -10,9 +8,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
-
-from sb3_cchain.replaced import replaced
 
 # "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
 Batch = dict[str, Any]
@@ -53,24 +48,3 @@ def map_batch(function: Callable[[Any], Any], batch: Batch) -> Batch:
     :return: The same with the results in their places
     """
     return {name: map_batch(function, value) if isinstance(value, dict) else function(value) for name, value in batch.items()}
-
-
-@contextmanager
-def recent_observations(env: VecEnv, size: int) -> Iterator[deque[np.ndarray]]:
-    """
-    For an algorithm that keeps no observations.
-
-    :param env: The training environment
-    :param size: How many to keep
-    :return: The last observations that it returned inside the ``with`` block
-    """
-    recent: deque[np.ndarray] = deque(maxlen=size)
-    step_wait = env.step_wait
-
-    def step_wait_and_keep() -> Any:
-        step = step_wait()
-        recent.extend(np.array(step[0]))
-        return step
-
-    with replaced(env, "step_wait", step_wait_and_keep):
-        yield recent

@@ -1,9 +1,8 @@
 """Shrink-and-perturb."""
 
-from typing import Any
-
 import torch as th
 
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
 from sb3_cchain.tasks.boundary import TaskBoundary
@@ -41,8 +40,6 @@ class ShrinkAndPerturb(TaskBoundary):
         environment that is not continual
     """
 
-    _hook: th.utils.hooks.RemovableHandle | None = None
-
     def __init__(self, shrink: float = 0.999999, interval: int | None = 1):
         super().__init__()
         check_number("shrink", shrink, 0, 1)
@@ -50,25 +47,24 @@ class ShrinkAndPerturb(TaskBoundary):
             check_number("interval", interval, 1, integer=True)
         self.shrink = shrink
         self.interval = interval
+        self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
         require_policy_optimizer(self)
 
     def _on_training_start(self) -> None:
-        self._on_training_end()  # of training that was interrupted
+        self._hooks.begin(self.model)
         self.n_steps = 0
         if self.interval is None:
             super()._on_training_start()
         else:
             self._n_updates = 0
-            self._hook = self.model.policy.optimizer.register_step_post_hook(self._after_update)
+            self._hooks.after_step(self.model.policy.optimizer, self._after_update)
 
     def _on_training_end(self) -> None:
-        if self._hook is not None:
-            self._hook.remove()
-            self._hook = None
+        self._hooks.remove()
 
-    def _after_update(self, *_: Any) -> None:
+    def _after_update(self, optimizer: th.optim.Optimizer) -> None:
         assert self.interval is not None
         self._n_updates += 1
         if self._n_updates % self.interval == 0:
