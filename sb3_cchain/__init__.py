@@ -1,5 +1,7 @@
 """C-CHAIN for Stable-Baselines3. Importing it registers the environments ``Continual/...`` with Gymnasium."""
 
+import sb3_cchain.gym_notice  # noqa: F401  # isort: skip  # before Stable-Baselines3
+
 from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
