@@ -1,0 +1,53 @@
+"""Callbacks that save models during training."""
+
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+from sb3_cchain.checkpoint.files import save_model, write_safely
+
+
+class SafeCheckpointCallback(CheckpointCallback):
+    """
+    Stable-Baselines3's ``CheckpointCallback``, whose files are whole or absent: training that is killed while it saves leaves
+    no torn file. Names and arguments are those of ``CheckpointCallback``.
+    """
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.save_freq == 0:
+            # The model comes last, so that whatever belongs to it is there when it is
+            if self.save_replay_buffer and getattr(self.model, "replay_buffer", None) is not None:
+                with write_safely(self._checkpoint_path("replay_buffer_", "pkl")) as path:
+                    self.model.save_replay_buffer(path)  # type: ignore[attr-defined]
+            normalize = self.model.get_vec_normalize_env()
+            if self.save_vecnormalize and normalize is not None:
+                with write_safely(self._checkpoint_path("vecnormalize_", "pkl")) as path:
+                    normalize.save(str(path))
+            model_path = self._checkpoint_path(extension="zip")
+            save_model(self.model, model_path)
+            if self.verbose >= 2:
+                print(f"Saving model checkpoint to {model_path}")
+        return True
+
+
+class SaveBestModel(BaseCallback):
+    """
+    Saves the model, and the statistics of its ``VecNormalize`` if there is one, whenever it is called: for ``EvalCallback``'s
+    ``callback_on_new_best``. The files are whole or absent, which those of ``best_model_save_path`` are not.
+
+    :param path: The zip file of the model
+    :param statistics_path: The pickle file of the statistics
+    """
+
+    def __init__(self, path: str | Path, statistics_path: str | Path):
+        super().__init__()
+        self.path = path
+        self.statistics_path = statistics_path
+
+    def _on_step(self) -> bool:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None:
+            with write_safely(self.statistics_path) as path:
+                normalize.save(str(path))
+        save_model(self.model, self.path)
+        return True

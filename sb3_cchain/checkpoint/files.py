@@ -1,0 +1,116 @@
+"""Files of saved training, which a process that is killed leaves either whole or as they were."""
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+@contextmanager
+def write_safely(path: str | Path) -> Iterator[Path]:
+    """
+    Write a file under another name beside it, and put it in its place when it is complete and on the disk. A process that is
+    killed in between leaves what was there before.
+
+    :param path: The file; its folder is made if it does not exist
+    :return: Yields the path to write to
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Its suffix keeps SB3 from adding one, and hides it from those who look for models
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    try:
+        yield unfinished
+        with open(unfinished, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+        _sync_folder(path.parent)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name == "posix":  # elsewhere folders cannot be opened
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def save_model(model: BaseAlgorithm, path: str | Path) -> None:
+    """
+    ``model.save(path)`` by :func:`write_safely`.
+
+    :param model: A model
+    :param path: The zip file; as in SB3, a path without a suffix gets ``.zip``
+    """
+    path = Path(path)
+    with write_safely(path if path.suffix else path.with_suffix(".zip")) as unfinished:
+        model.save(unfinished)
+
+
+def check_model_file(path: str | Path) -> None:
+    """
+    :param path: A saved model
+    :raises ValueError: When the file is torn, as a kill during ``model.save()`` leaves it, or no saved model; the message
+        names the newest whole model in the same folder
+    """
+    path = Path(path)
+    fault = _fault(path)
+    if fault is None:
+        return
+    others = sorted((other for other in path.parent.glob("*.zip") if other != path), key=os.path.getmtime, reverse=True)
+    whole = next((other for other in others if _fault(other) is None), None)
+    found = "There is no whole model beside it" if whole is None else f"The newest whole model beside it is {whole}"
+    raise ValueError(f"{path} {fault}. {found}")
+
+
+def _fault(path: Path) -> str | None:
+    """What is wrong with a saved model, if anything."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            torn = archive.testzip() is not None
+            names = archive.namelist()
+    except (zipfile.BadZipFile, zlib.error, EOFError):
+        torn = True
+    if torn:
+        return "is torn or not a zip file: perhaps training was killed while it was written"
+    if "data" not in names:
+        return "holds no settings of a model (no entry `data`): save it by the model's save()"
+    return None
+
+
+def saved_timesteps(path: str | Path) -> int:
+    """
+    :param path: A saved model
+    :return: Environment steps that it was trained for. The rest of the file is not unpickled
+    """
+    with zipfile.ZipFile(path) as archive:
+        return int(json.loads(archive.read("data"))["num_timesteps"])
+
+
+def load_statistics(normalize: VecNormalize, path: str | Path) -> None:
+    """
+    Give a ``VecNormalize`` the statistics of a saved one. Its settings stay as they are.
+
+    :param normalize: The wrapper, or one of its subclasses
+    :param path: What ``VecNormalize.save()`` wrote
+    :raises ValueError: When one of both normalises observations and the other does not
+    """
+    saved = VecNormalize.load(str(path), normalize.venv)
+    if saved.norm_obs != normalize.norm_obs:
+        raise ValueError(
+            f"The statistics in {path} are of norm_obs={saved.norm_obs}, but training has norm_obs={normalize.norm_obs}. "
+            "Normalise as the model was trained"
+        )
+    # TaskVecNormalize also knows the task that its statistics belong to
+    for name in ("obs_rms", "ret_rms", "_statistics_task"):
+        if name in vars(saved):
+            setattr(normalize, name, vars(saved)[name])
