@@ -1,124 +1,121 @@
 """
-The command ``sb3-cchain train|enjoy|plot_train|all_plots|plot_from_file``: RL Zoo's own commands, which know our
-algorithms and the related methods and find our hyperparameters; and ``sb3-cchain inspect``.
+The command ``sb3-cchain``: RL Zoo's commands, which know our algorithms and the related methods and find our hyperparameters,
+and ``sb3-cchain inspect``.
 """
 
-import argparse
+import runpy
+import subprocess
 import sys
-from pathlib import Path
+import warnings
 from typing import Any
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 try:
     import rl_zoo3.cli
-    import rl_zoo3.exp_manager
+    import rl_zoo3.train
     from rl_zoo3 import ALGOS
 except ImportError as error:
     raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
-from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.checkpoint import check_model_file
+from sb3_cchain.methods.registry import REGISTRY
+from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo import inspect as zoo_inspect
-from sb3_cchain.zoo.search import GRIDS, register_search_spaces
+from sb3_cchain.zoo.experiment import ExperimentManager
+from sb3_cchain.zoo.search import register_search_spaces
+from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
 
-OUR_ALGOS: dict[str, type[BaseAlgorithm]] = {"ppo_cchain": CChainPPO, "dqn_cchain": CChainDQN, "double_dqn": DoubleDQN}
+__all__ = ["hyperparams_folder", "main", "register_algorithms"]
 
-# The related methods are settings of an algorithm, under a name of their own
-METHODS = {
-    "ppo_oracle": "ppo",
-    "ppo_trac": "ppo",
-    "ppo_weight_clipping": "ppo",
-    "ppo_l2_init": "ppo",
-    "ppo_layer_norm": "ppo",
-    "ppo_redo": "ppo",
-    "ppo_adam_rel": "ppo",
-    "double_dqn_oracle": "double_dqn",
-}
+# RL Zoo's console script has these
+SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file")
+# and these are modules to run by `python -m rl_zoo3.NAME`
+MODULES = ("record_video", "record_training", "benchmark", "load_from_hub", "push_to_hub")
+COMMANDS = (*SCRIPTS[:2], "inspect", *SCRIPTS[2:], *MODULES)
+# They load a model to look at what it does
+PLAYING = ("enjoy", "record_video", "push_to_hub")
+
+_RL_ZOO_ALGOS = dict(ALGOS)
 
 
-def register_algorithms() -> None:
+def register_algorithms(playing: bool = False) -> None:
     """
-    Make our algorithms and the related methods known to RL Zoo, in place, and let ``normalize: ...`` in a YAML file restart at
-    each task (``restart=False`` in it does not). Where there are no tasks it is SB3's ``VecNormalize``.
+    Make all rows of the registry known to RL Zoo, in place.
+
+    :param playing: Whether models are loaded to play, not to train; see :func:`for_playing`
     """
-    rl_zoo3.exp_manager.VecNormalize = TaskVecNormalize  # type: ignore[misc]
-    ALGOS.update(OUR_ALGOS)
-    ALGOS.update({method: ALGOS[algo] for method, algo in METHODS.items()})
+    algorithms = {**_RL_ZOO_ALGOS, **{method.algo: method.algorithm for method in REGISTRY}}
+    ALGOS.update({name: for_playing(algorithm) if playing else algorithm for name, algorithm in algorithms.items()})
     register_search_spaces()
+    rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
 
 
-def hyperparams_folder() -> Path:
+def for_playing(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     """
-    :return: The folder of our YAML files: inside the installed package, at the root of a checkout
+    :param algorithm: An algorithm
+    :return: The same, whose ``load()`` makes no replay buffer (RL Zoo does so for a list of names only) and checks that the
+        file is whole
     """
-    package = Path(__file__).parent.parent
-    inside = package / "zoo_hyperparams"
-    return inside if inside.is_dir() else package.parent / "zoo_hyperparams"
+
+    def load(path: str, *args: Any, **kwargs: Any) -> BaseAlgorithm:
+        check_model_file(path)
+        if issubclass(algorithm, OffPolicyAlgorithm):
+            kwargs.update(buffer_size=1, optimize_memory_usage=False)
+        return algorithm.load(path, *args, **kwargs)
+
+    return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
 
 
-def hyperparams_file(algo: str, env_id: str) -> Path | None:
+def call_our_command(command: list[str], *args: Any, **kwargs: Any) -> int:
     """
-    :param algo: Name of the algorithm on the command line
-    :param env_id: Environment id
-    :return: Our YAML file, where we have settings for the environment or where the algorithm is ours; otherwise None,
-        and RL Zoo's settings hold
+    What ``subprocess.call`` is to RL Zoo's ``record_training`` and ``benchmark``, which start others of RL Zoo's commands.
+
+    :param command: A command and its arguments
+    :param args: Other arguments of ``subprocess.call``
+    :param kwargs: Other arguments of ``subprocess.call``
+    :return: Exit code
     """
-    path = hyperparams_folder() / f"{algo}.yml"
-    if path.is_file() and (algo in OUR_ALGOS or env_id in _settings(path)):
-        return path
-    return None
-
-
-def _settings(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text())
-
-
-def with_our_hyperparams(arguments: list[str]) -> list[str]:
-    """
-    :param arguments: Arguments of RL Zoo's ``train``
-    :return: The same, with our YAML file where we have one
-    :raises SystemExit: When a related method has no settings for the environment, or is to be optimised and has nothing that
-        could be
-    """
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo", default="ppo")
-    parser.add_argument("--env", default="CartPole-v1")
-    parser.add_argument("-conf", "--conf-file")
-    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
-    given, _ = parser.parse_known_args(arguments)
-    ours = hyperparams_file(given.algo, given.env)
-    if given.algo in METHODS:
-        if given.optimize_hyperparameters and given.algo not in GRIDS:
-            sys.exit(
-                f"-optimize: {given.algo} has no hyperparameters of its own to search. "
-                f"Those of {METHODS[given.algo]} are searched by --algo {METHODS[given.algo]} -optimize."
-            )
-        if ours is None and given.conf_file is None:
-            covered = [key for key in _settings(hyperparams_folder() / f"{given.algo}.yml") if not key.endswith("-defaults")]
-            sys.exit(
-                f"{given.algo}.yml has no settings for {given.env}, only for {', '.join(covered)}. "
-                "For another environment, give a YAML file of your own: -conf FILE"
-            )
-    # First, so that a file given by the user wins
-    return arguments if ours is None else ["--conf-file", str(ours), *arguments]
+    for stock, name in ((["python", "-m", "rl_zoo3.record_video"], "record_video"), (["python", "enjoy.py"], "enjoy")):
+        if command[: len(stock)] == stock:
+            command = [sys.executable, "-m", "sb3_cchain.zoo", name, *command[len(stock) :]]
+    return subprocess.run(command, *args, **kwargs).returncode
 
 
 def main() -> None:
-    """Run RL Zoo's command line."""
-    commands = ["train", "enjoy", "inspect", "plot_train", "all_plots", "plot_from_file"]
-    if len(sys.argv) < 2 or sys.argv[1] not in commands:
+    """Run the command that ``sys.argv`` names."""
+    if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
         sys.exit(
-            f"usage: sb3-cchain {{{'|'.join(commands)}}} ...\n"
-            "The options are those of RL Zoo: sb3-cchain train --help. inspect is ours: sb3-cchain inspect --help"
+            f"usage: sb3-cchain {{{'|'.join(COMMANDS)}}} ...\n"
+            "All but inspect have the options of RL Zoo. Each lists them: sb3-cchain train --help"
         )
-    register_algorithms()
-    if sys.argv[1] == "inspect":
-        return zoo_inspect.main(sys.argv[2:])
-    if sys.argv[1] == "train":
-        sys.argv[2:] = with_our_hyperparams(sys.argv[2:])
-    rl_zoo3.cli.main()
+    command = sys.argv[1]
+    register_algorithms(playing=command in PLAYING)
+    # RL Zoo reads the files beside a model by a loader that runs what is in them
+    with replaced(yaml, "UnsafeLoader", SettingsLoader):
+        if command == "inspect":
+            zoo_inspect.main(sys.argv[2:])
+        elif command in MODULES:
+            run_module(command)
+        else:
+            if command == "train":
+                sys.argv[2:] = add_settings_file(sys.argv[2:])
+            rl_zoo3.cli.main()
+
+
+def run_module(name: str) -> None:
+    """
+    Run a module of RL Zoo's as ``python -m`` does, with the algorithms registered.
+
+    :param name: Its name, which ``sys.argv[1]`` is as well
+    """
+    del sys.argv[1]
+    with replaced(subprocess, "call", call_our_command), warnings.catch_warnings():
+        # enjoy has imported load_from_hub before
+        warnings.filterwarnings("ignore", message=".*found in sys.modules", category=RuntimeWarning)
+        runpy.run_module(f"rl_zoo3.{name}", run_name="__main__")
 
 
 if __name__ == "__main__":

@@ -5,9 +5,11 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 import yaml
 from rich.console import Console
 from rl_zoo3 import ALGOS
@@ -21,14 +23,16 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.analysis.inspection import algorithm_of, inspect_model, plot, report
+from sb3_cchain.checkpoint import check_model_file
+from sb3_cchain.zoo.settings import SettingsLoader
 
 
 def make_as_trained(
     model_path: Path, env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]
 ) -> tuple[VecEnv, list[BaseCallback]]:
     """
-    What a model was trained in by RL Zoo: the environment with its arguments, wrappers and normalisation, and the callbacks of
-    its settings. For a model that lies in no folder of RL Zoo's, the environment as it is.
+    Make what RL Zoo trained a model with: the environment with its arguments, wrappers and normalisation, and the callbacks of
+    its settings. For a model that is in no folder of RL Zoo's, that is the environment as it is.
 
     :param model_path: The saved model
     :param env_id: Environment id
@@ -36,12 +40,15 @@ def make_as_trained(
     :param seed: Seed
     :param env_kwargs: Arguments of the environment, besides those it was trained with
     :return: The environment, as in training, and the callbacks
+    :raises ValueError: When the ``args.yml`` beside the model is not one of RL Zoo's
     """
     folder = model_path.parent / env_id.replace("/", "-")
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
     if (folder / "args.yml").is_file():
-        trained_with = yaml.load((folder / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
-        env_kwargs = {**(trained_with["env_kwargs"] or {}), **env_kwargs}
+        arguments = yaml.load((folder / "args.yml").read_text(), Loader=SettingsLoader)
+        if not isinstance(arguments, dict):
+            raise ValueError(f"{folder / 'args.yml'} must map names to values, as RL Zoo writes it")
+        env_kwargs = {**(arguments.get("env_kwargs") or {}), **env_kwargs}
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
     callbacks = get_callback_list(hyperparams)
     env = create_test_env(
@@ -62,13 +69,86 @@ def make_as_trained(
 
 def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
     """
-    :return: By name on the command line, those of RL Zoo's algorithms of which all can be reported
+    :return: By name on the command line, the algorithms of which everything in the report can be measured
     """
     return {
         name: algorithm
         for name, algorithm in ALGOS.items()
         if (issubclass(algorithm, (OnPolicyAlgorithm, DQN)) or name == "qrdqn") and name != "ppo_lstm"
     }
+
+
+def check_writable(folder: Path) -> None:
+    """
+    Make a folder, and write to it.
+
+    :param folder: The folder
+    :raises OSError: When one of both is impossible
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryFile(dir=folder) as file:
+        file.write(bytes(4096))
+        file.flush()
+
+
+def load_as_trained(
+    path: Path, algo: str | None, env_id: str, env_kwargs: dict[str, Any], seed: int, n_steps: int, device: str
+) -> tuple[BaseAlgorithm, list[BaseCallback]]:
+    """
+    Load a model with the environment that it was trained in.
+
+    :param path: The saved model
+    :param algo: Name of its algorithm on the command line; if None, the file tells
+    :param env_id: Environment id
+    :param env_kwargs: Arguments of the environment, besides those it was trained with
+    :param seed: Seed of the environment
+    :param n_steps: Size of the replay buffer, for off-policy algorithms
+    :param device: PyTorch device
+    :return: The model, and the callbacks of its settings
+    :raises ValueError: When the file is no whole model or one of another algorithm, or parameters are not finite
+    """
+    check_model_file(path)
+    algorithm = known_algorithms()[algo] if algo else algorithm_of(path)
+    data, *_ = load_from_zip_file(path, device="cpu", load_data=True)
+    assert data is not None
+    if algo:
+        check_algorithm(path, data, algo)
+    env, callbacks = make_as_trained(path, env_id, data.get("n_envs", 1), seed, env_kwargs)
+    settings: dict[str, Any] = {"buffer_size": n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
+    try:
+        model = algorithm.load(path, env, device=device, **settings)
+    except (AssertionError, AttributeError, KeyError, RuntimeError) as error:
+        # Whatever a file of another algorithm or version lacks
+        raise ValueError(
+            f"it cannot be loaded as {algorithm.__name__}: {error!r}. Give the --algo that it was saved by"
+        ) from error
+    for name, parameter in model.policy.named_parameters():
+        if not th.isfinite(parameter).all():
+            raise ValueError(
+                f"its parameter {name} has entries that are not finite: nothing can be measured in such a network"
+            )
+    return model, callbacks
+
+
+def check_algorithm(path: Path, data: dict[str, Any], algo: str) -> None:
+    """
+    :param path: A saved model
+    :param data: Its attributes
+    :param algo: Name of an algorithm on the command line
+    :raises ValueError: When the model was saved by another one
+    """
+    algorithm = known_algorithms()[algo]
+    policies = tuple(algorithm.policy_aliases.values())
+    if not issubclass(data["policy_class"], policies):
+        raise ValueError(
+            f"it was not saved by {algorithm.__name__} (its policy is a {data['policy_class'].__name__}): --algo {algo}"
+        )
+    try:
+        saved_by = algorithm_of(path)
+    except ValueError:
+        return  # it cannot be told
+    if not (issubclass(saved_by, algorithm) or issubclass(algorithm, saved_by)):
+        raise ValueError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}: leave --algo {algo} away")
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -78,7 +158,7 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="sb3-cchain inspect",
         description="Roll out saved models, train them a little, and report their churn, their neural tangent kernel and the "
-        "health of their networks. The files stay as they are.",
+        "health of their networks. The files are not changed.",
     )
     parser.add_argument("models", nargs="+", type=Path, metavar="MODEL.zip", help="One saved model, or two to compare")
     parser.add_argument("--env", required=True, help="Environment id")
@@ -93,12 +173,14 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--task", type=int, help="Task of a continual environment, by default the one that training would go on with"
     )
-    parser.add_argument("--algo", choices=sorted(known_algorithms()), help="Algorithm, by default told from the file")
-    parser.add_argument("--n-steps", type=int, default=2048, help="Environment steps of a DQN's rollout; a PPO's is its own")
+    parser.add_argument("--algo", choices=sorted(known_algorithms()), help="Algorithm, by default the one that the file tells")
+    parser.add_argument(
+        "--n-steps", type=int, default=2048, help="Environment steps of a DQN's rollout; PPO has its `n_steps`"
+    )
     parser.add_argument("--n-updates", type=int, default=100, help="Gradient updates of a DQN whose churn is measured")
     parser.add_argument("--seed", type=int, default=0, help="Seed of rollout and updates")
     parser.add_argument("--device", default="auto", help="PyTorch device")
-    parser.add_argument("--output", type=Path, default=Path("inspection"), help="Folder of the picture and of the figures")
+    parser.add_argument("--output", type=Path, default=Path("inspection"), help="Folder for the picture and the numbers")
     args = parser.parse_args(arguments)
     if len(args.models) > 2:
         parser.error(f"one model, or two to compare; got {len(args.models)}")
@@ -108,6 +190,10 @@ def main(arguments: Sequence[str]) -> None:
     for path in args.models:
         if not path.is_file():
             parser.error(f"no such file: {path}")
+    try:
+        check_writable(args.output)
+    except OSError as error:
+        parser.error(f"--output {args.output}: {error.strerror}. Give a folder that can be written to")
 
     env_kwargs = args.env_kwargs
     if args.task is not None:  # and long enough to stay there, however long the model was trained
@@ -117,28 +203,27 @@ def main(arguments: Sequence[str]) -> None:
     inspections = []
     for name, path in zip(names, args.models, strict=True):
         try:
-            algorithm = known_algorithms()[args.algo] if args.algo else algorithm_of(path)
-            data, *_ = load_from_zip_file(path, device="cpu", load_data=True)
-            assert data is not None
-            env, callbacks = make_as_trained(path, args.env, data["n_envs"], args.seed, env_kwargs)
-            # The buffer is as large as what is rolled out
-            settings = {"buffer_size": args.n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
-            model = algorithm.load(path, env, device=args.device, **settings)
-        except (TypeError, ValueError, gym.error.Error) as error:
-            parser.error(f"{path} in {args.env} {env_kwargs or ''}: {error}")
+            model, callbacks = load_as_trained(path, args.algo, args.env, env_kwargs, args.seed, args.n_steps, args.device)
+        except (TypeError, ValueError, yaml.YAMLError, gym.error.Error) as error:
+            message = " ".join(str(error).split())
+            parser.error(f"{path} in {args.env} {env_kwargs or ''}: {message}")
         if model.lr_schedule(model._current_progress_remaining) == 0:
             console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
         model.set_random_seed(args.seed)
-        console.print(f"{name}: {path}, {algorithm.__name__}, {model.num_timesteps} steps of training", soft_wrap=True)
+        console.print(f"{name}: {path}, {type(model).__name__}, {model.num_timesteps} steps of training", soft_wrap=True)
         inspections.append(inspect_model(model, name, args.n_steps, args.n_updates, callbacks))
-        env.close()
+        assert model.env is not None
+        model.env.close()
     for table in report(inspections):
         console.print(table)
-    plot(inspections, args.output / "inspection.png")
     figures = [
-        # JSON has neither infinity nor what is not a number
+        # JSON has neither infinity nor NaN
         {"model": str(path), **{tag: value if math.isfinite(value) else None for tag, value in inspection.figures.items()}}
         for path, inspection in zip(args.models, inspections, strict=True)
     ]
-    (args.output / "inspection.json").write_text(json.dumps(figures, indent=1))
+    try:
+        plot(inspections, args.output / "inspection.png")
+        (args.output / "inspection.json").write_text(json.dumps(figures, indent=1))
+    except OSError as error:
+        parser.error(f"--output {args.output}: {error.strerror}")
     console.print(f"Written: {args.output}/inspection.png, {args.output}/inspection.json", soft_wrap=True)

@@ -1,53 +1,35 @@
 """What ``sb3-cchain train -optimize`` searches for our algorithms and for the related methods."""
 
-from copy import copy
+from collections.abc import Callable
 from typing import Any
 
 import optuna
-import rl_zoo3.exp_manager
-import rl_zoo3.train
-from rl_zoo3.hyperparams_opt import (
-    HYPERPARAMS_CONVERTER,
-    HYPERPARAMS_SAMPLER,
-    convert_offpolicy_params,
-    convert_onpolicy_params,
-    sample_her_params,
-    sample_ppo_params,
-)
+from rl_zoo3 import ALGOS, hyperparams_opt
+from rl_zoo3.hyperparams_opt import convert_offpolicy_params, sample_her_params
+from rl_zoo3.utils import get_class_by_name
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-# The paper's grids: clipping range κ, regularisation coefficient c. It has none for ReDo: τ is none but dead units, the
-# original's value for DQN and four times that; the interval in iterations is Plasticine's, a tenth and ten times that.
-GRIDS: dict[str, dict[str, list[float]]] = {
-    "ppo_weight_clipping": {"clip_ratio": [0.1, 0.5, 1.0, 10.0]},
-    "ppo_l2_init": {"coef": [0.1, 1.0, 10.0, 100.0, 1000.0]},
-    "ppo_redo": {"tau": [0.0, 0.025, 0.1], "interval": [1, 10, 100]},
-}
-REDO = "sb3_cchain.methods.ReDo"
+from sb3_cchain.algorithms import DoubleDQN
+from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+from sb3_cchain.methods.registry import REGISTRY, Method
 
+# Arguments: Optuna's trial, the dimension of continuous actions (0 for others), the number of environments, and RL Zoo's
+# `additional_args`. Returns hyperparameters of the algorithm.
+Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
+# From the values of a trial to the hyperparameters that they stand for
+Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
-def sample_ppo_cchain_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    RL Zoo's search space for PPO, and β.
-
-    :param trial: Optuna's trial
-    :param n_actions: Dimension of continuous actions, 0 for others
-    :param n_envs: Number of environments
-    :param additional_args: See RL Zoo
-    :return: Hyperparameters of ``CChainPPO``
-    """
-    # A decade beyond the paper's values on either side: 1e3 to 1e5 for discrete actions, 0.05 to 0.5 for continuous ones
-    low, high = (5e-3, 5.0) if n_actions > 0 else (1e2, 1e6)
-    target_churn_ratio = trial.suggest_float("target_churn_ratio", low, high, log=True)
-    return {**sample_ppo_params(trial, n_actions, n_envs, additional_args), "target_churn_ratio": target_churn_ratio}
+# RL Zoo's, by name on the command line
+HYPERPARAMS_SAMPLER: dict[str, Any] = hyperparams_opt.HYPERPARAMS_SAMPLER
+HYPERPARAMS_CONVERTER: dict[str, Any] = hyperparams_opt.HYPERPARAMS_CONVERTER
 
 
 def sample_double_dqn_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    RL Zoo's search space for DQN, less the network: its choice would replace the whole of ``policy_kwargs``, and so the
+    RL Zoo's search space for DQN without the network: its choice would replace the whole of ``policy_kwargs``, and with it the
     feature extractor of the YAML file.
 
     :param trial: Optuna's trial
@@ -69,27 +51,10 @@ def sample_double_dqn_params(
     }
     if additional_args["using_her_replay_buffer"]:
         sampled = sample_her_params(trial, sampled, additional_args["her_kwargs"])
-    return convert_dqn_params(sampled)
+    return convert_double_dqn_params(sampled)
 
 
-def sample_dqn_cchain_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    The search space of ``DoubleDQN``, and β.
-
-    :param trial: Optuna's trial
-    :param n_actions: Dimension of continuous actions, 0 for others
-    :param n_envs: Number of environments
-    :param additional_args: See RL Zoo
-    :return: Hyperparameters of ``CChainDQN``
-    """
-    # A decade beyond the paper's 0.01 on either side
-    target_churn_ratio = trial.suggest_float("target_churn_ratio", 1e-3, 1e-1, log=True)
-    return {**sample_double_dqn_params(trial, n_actions, n_envs, additional_args), "target_churn_ratio": target_churn_ratio}
-
-
-def convert_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def convert_double_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: Values of a trial
     :return: The hyperparameters that they stand for, without a network
@@ -99,42 +64,24 @@ def convert_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
-class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
+def with_target_churn_ratio(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sampler:
     """
-    RL Zoo's, which also searches the grids of the related methods. Their values stand within ``policy_kwargs`` and
-    ``callback`` of the settings, the first of which RL Zoo's samplers replace as a whole, and the second not at all.
+    :param sampler: Search space of the algorithm without churn reduction
+    :param algorithm: An algorithm with churn reduction
+    :return: The same search space, and β: a decade beyond the paper's values on either side
     """
 
-    def objective(self, trial: optuna.Trial) -> float:
-        """
-        :param trial: Optuna's trial
-        :return: Mean reward of the last evaluation
-        :raises ValueError: When ReDo is to be searched and the settings do not have it
-        """
-        values = {name: trial.suggest_categorical(name, grid) for name, grid in GRIDS.get(self.algo, {}).items()}
-        manager = copy(self)  # trials may run side by side
-        if self.algo == "ppo_redo":
-            manager.specified_callbacks = with_arguments(self.specified_callbacks, REDO, values)
-        elif values:
-            policy_kwargs = dict(self._hyperparams.get("policy_kwargs", {}))
-            policy_kwargs["optimizer_kwargs"] = {**policy_kwargs.get("optimizer_kwargs", {}), **values}
-            manager._hyperparams = {**self._hyperparams, "policy_kwargs": policy_kwargs}
-        return super(ExperimentManager, manager).objective(trial)
+    def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+        if not issubclass(algorithm, OnPolicyAlgorithm):
+            low, high = 1e-3, 1e-1  # around 0.01
+        elif n_actions > 0:
+            low, high = 5e-3, 5.0  # around 0.05 to 0.5
+        else:
+            low, high = 1e2, 1e6  # around 1e3 to 1e5
+        target_churn_ratio = trial.suggest_float("target_churn_ratio", low, high, log=True)
+        return {**sampler(trial, n_actions, n_envs, additional_args), "target_churn_ratio": target_churn_ratio}
 
-
-def with_arguments(callbacks: str | list[Any], name: str, arguments: dict[str, Any]) -> list[Any]:
-    """
-    :param callbacks: ``callback`` of a YAML file
-    :param name: Name of one of them
-    :param arguments: Arguments of it
-    :return: The same with these arguments
-    :raises ValueError: When there is none of that name
-    """
-    entries = [callbacks] if isinstance(callbacks, str) else callbacks
-    with_kwargs = [{entry: {}} if isinstance(entry, str) else entry for entry in entries]
-    if not any(name in entry for entry in with_kwargs):
-        raise ValueError(f"`callback` must have {name}, got {callbacks}")
-    return [{name: {**entry[name], **arguments}} if name in entry else entry for entry in with_kwargs]
+    return sample
 
 
 def refuse_trial(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -145,14 +92,65 @@ def refuse_trial(sampled_params: dict[str, Any]) -> dict[str, Any]:
     raise ValueError(f"`--trial-id` cannot put {sampled_params} into the settings: give a YAML file of your own, -conf FILE")
 
 
+# By class, RL Zoo's and those of our algorithms that differ from them
+_SEARCH_SPACES: dict[type[BaseAlgorithm], tuple[Sampler, Converter]] = {
+    **{ALGOS[name]: (HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name]) for name in HYPERPARAMS_SAMPLER},
+    DoubleDQN: (sample_double_dqn_params, convert_double_dqn_params),
+}
+_RL_ZOO_NAMES = frozenset(HYPERPARAMS_SAMPLER)
+
+
 def register_search_spaces() -> None:
-    """Make the search spaces known to RL Zoo, in place."""
-    rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
-    HYPERPARAMS_SAMPLER["ppo_cchain"] = sample_ppo_cchain_params
-    HYPERPARAMS_CONVERTER["ppo_cchain"] = convert_onpolicy_params
-    HYPERPARAMS_SAMPLER["double_dqn"] = sample_double_dqn_params
-    HYPERPARAMS_SAMPLER["dqn_cchain"] = sample_dqn_cchain_params
-    HYPERPARAMS_CONVERTER["double_dqn"] = HYPERPARAMS_CONVERTER["dqn_cchain"] = convert_dqn_params
-    for method in GRIDS:
-        HYPERPARAMS_SAMPLER[method] = lambda *_: {}  # the ExperimentManager does it
-        HYPERPARAMS_CONVERTER[method] = refuse_trial
+    """Make the search spaces of all methods known to RL Zoo, in place."""
+    for method in REGISTRY:
+        if method.grid:
+            HYPERPARAMS_SAMPLER[method.algo] = lambda *_: {}  # our ExperimentManager searches the grid
+            HYPERPARAMS_CONVERTER[method.algo] = refuse_trial
+        elif not method.is_related and method.algo not in _RL_ZOO_NAMES:
+            # That of the nearest base that has one
+            space = next((_SEARCH_SPACES[base] for base in method.algorithm.__mro__ if base in _SEARCH_SPACES), None)
+            if space is None:
+                continue
+            sampler, HYPERPARAMS_CONVERTER[method.algo] = space
+            has_churn = issubclass(method.algorithm, ChurnAlgorithm)
+            HYPERPARAMS_SAMPLER[method.algo] = with_target_churn_ratio(sampler, method.algorithm) if has_churn else sampler
+
+
+def suggest_from_grid(trial: optuna.Trial, method: Method) -> dict[str, Any]:
+    """
+    :param trial: Optuna's trial
+    :param method: A method
+    :return: A value of each argument in its grid
+    """
+    return {name: trial.suggest_categorical(name, list(values)) for name, values in method.grid.items()}
+
+
+def add_to_policy_kwargs(hyperparams: dict[str, Any], optimizer_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param hyperparams: Hyperparameters of an algorithm
+    :param optimizer_kwargs: Arguments of the optimiser
+    :return: The same with these arguments, and all others as they were
+    """
+    policy_kwargs = dict(hyperparams.get("policy_kwargs", {}))
+    policy_kwargs["optimizer_kwargs"] = {**policy_kwargs.get("optimizer_kwargs", {}), **optimizer_kwargs}
+    return {**hyperparams, "policy_kwargs": policy_kwargs}
+
+
+def add_to_callback(callbacks: str | list[Any], callback_class: type, arguments: dict[str, Any]) -> list[Any]:
+    """
+    :param callbacks: ``callback`` of a YAML file
+    :param callback_class: Class of one of them
+    :param arguments: Arguments of that one
+    :return: The same with these arguments, and all others as they were
+    :raises ValueError: When there is no such callback
+    """
+    entries = [callbacks] if isinstance(callbacks, str) else callbacks
+    with_arguments, found = [], False
+    for entry in entries:
+        ((name, given),) = entry.items() if isinstance(entry, dict) else [(entry, {})]
+        if issubclass(get_class_by_name(name), callback_class):
+            found, given = True, {**given, **arguments}
+        with_arguments.append({name: given})
+    if not found:
+        raise ValueError(f"-optimize: `callback` must have {callback_class.__name__}, got {callbacks}")
+    return with_arguments

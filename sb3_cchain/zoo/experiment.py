@@ -1,0 +1,192 @@
+"""RL Zoo's training, with run folders that are never shared, saves that a kill does not tear, and training that goes on."""
+
+import re
+from copy import copy
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import optuna
+import rl_zoo3.exp_manager
+from rl_zoo3.utils import get_latest_run_id
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_cchain.checkpoint import (
+    SafeCheckpointCallback,
+    SaveBestModel,
+    check_model_file,
+    load_statistics,
+    save_model,
+    saved_timesteps,
+    write_safely,
+)
+from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.methods.registry import BY_ALGO
+from sb3_cchain.replaced import replaced
+from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
+
+
+class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
+    """
+    RL Zoo's ``ExperimentManager``, with these differences:
+
+    - Each training has folders of its own, for RL Zoo's files and for TensorBoard, even if several start at once.
+    - ``normalize`` in a YAML file is :class:`~sb3_cchain.envs.TaskVecNormalize`, which restarts at each task (with
+      ``restart=False`` in it, it does not). Where there are no tasks it is Stable-Baselines3's ``VecNormalize``.
+    - Checkpoints, the best and the final model are whole or absent. They come with the statistics of ``VecNormalize``.
+    - Training from a saved model (``-i``) goes on at its step, its task and its statistics.
+    - ``-optimize`` searches the grids of the related methods.
+    """
+
+    def create_log_folder(self) -> None:
+        """
+        Make the folder of this training.
+
+        :raises ValueError: When training is to go on from a file that is no whole model, that lacks its statistics, or that
+            was trained to the end
+        """
+        if self.continue_training:
+            self._check_trained_agent()
+        if not self.args.uuid:
+            self.save_path = str(make_run_folder(self.log_path, self.env_name))
+            self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
+
+    def _check_trained_agent(self) -> None:
+        check_model_file(self.trained_agent)
+        if self.normalize:
+            self._find_statistics()
+        if self.args.n_timesteps <= 0:  # not given: train up to the number of the settings
+            done = saved_timesteps(self.trained_agent)
+            if done >= self.n_timesteps:
+                raise ValueError(
+                    f"{self.trained_agent} was trained for {done} steps, and the settings have {self.n_timesteps}. "
+                    "Say how many more are to come: -n STEPS"
+                )
+            self.n_timesteps -= done
+
+    def _find_statistics(self) -> Path:
+        """The file with the statistics of ``VecNormalize`` that belong to the saved model."""
+        path = statistics_path(self.trained_agent, self.env_name)
+        if not path.is_file():
+            raise ValueError(
+                f"Training with normalisation goes on from {self.trained_agent} with the statistics that were saved with it, "
+                f"but there is no file {path}"
+            )
+        return path
+
+    def create_callbacks(self) -> None:
+        """Make the callbacks of the command line's options."""
+        checkpoint_callback = partial(SafeCheckpointCallback, save_vecnormalize=True)
+        n_given = len(self.callbacks)
+        with replaced(rl_zoo3.exp_manager, "CheckpointCallback", checkpoint_callback):
+            super().create_callbacks()
+        for callback in self.callbacks[n_given:]:
+            if isinstance(callback, EvalCallback):
+                callback.best_model_save_path = None
+                callback.callback_on_new_best = SaveBestModel(
+                    f"{self.save_path}/best_model.zip", f"{self.params_path}/vecnormalize.pkl"
+                )
+                callback.callback_on_new_best.parent = callback
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        if not self.normalize:
+            return env
+        evaluation = {"training": False, "norm_reward": False} if eval_env else {}
+        return TaskVecNormalize(env, **{**self.normalize_kwargs, **evaluation})
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None:
+            load_statistics(normalize, self._find_statistics())
+        elif (path := statistics_path(self.trained_agent, self.env_name)).is_file():
+            raise ValueError(f"{self.trained_agent} was trained with normalisation ({path}): keep `normalize` in the settings")
+        return super()._load_pretrained_agent(hyperparams, env)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        Train a model. One that was loaded goes on counting its steps.
+
+        :param model: The model
+        """
+        if self.tensorboard_log is not None:
+            folder = make_run_folder(self.tensorboard_log, type(model).__name__)
+            model.set_logger(configure(str(folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
+        if self.continue_training:
+            # RL Zoo's method has no place for `reset_num_timesteps`
+            learn = partial(model.learn, reset_num_timesteps=False)
+            model = SimpleNamespace(learn=learn, env=model.env, policy=model.policy)  # type: ignore[assignment]
+        super().learn(model)
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        Save the model, the statistics of its ``VecNormalize`` if there is one, and its replay buffer if asked for.
+
+        :param model: The model
+        """
+        print(f"Saving to {self.save_path}")
+        normalize = model.get_vec_normalize_env()
+        if normalize is not None:
+            with write_safely(f"{self.params_path}/vecnormalize.pkl") as path:
+                normalize.save(str(path))
+        if isinstance(model, OffPolicyAlgorithm) and self.save_replay_buffer:
+            print("Saving replay buffer")
+            with write_safely(f"{self.save_path}/replay_buffer.pkl") as path:
+                model.save_replay_buffer(path)
+        save_model(model, f"{self.save_path}/{self.env_name}.zip")
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        Train with the values of a trial. Those of the related methods stand within ``policy_kwargs`` and ``callback`` of the
+        settings, the first of which RL Zoo's samplers replace as a whole, and the second not at all.
+
+        :param trial: Optuna's trial
+        :return: Mean reward of the last evaluation
+        :raises ValueError: When arguments of a callback are to be searched that is not in the settings
+        """
+        manager = copy(self)  # trials may run side by side
+        method = BY_ALGO.get(self.algo)
+        if method is not None and method.grid:
+            values = suggest_from_grid(trial, method)
+            if method.optimizer_class is not None:
+                manager._hyperparams = add_to_policy_kwargs(self._hyperparams, values)
+            else:
+                manager.specified_callbacks = add_to_callback(self.specified_callbacks, method.callbacks[0], values)
+        return super(ExperimentManager, manager).objective(trial)
+
+
+def make_run_folder(parent: str | Path, name: str) -> Path:
+    """
+    Make the next of the folders ``name_1``, ``name_2`` and so on. No two calls get the same, whatever processes they are in.
+
+    :param parent: Folder to make it in
+    :param name: Name without its number
+    :return: The new folder
+    """
+    number = get_latest_run_id(str(parent), name) + 1
+    while True:
+        folder = Path(parent) / f"{name}_{number}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:  # made by another process since
+            number += 1
+
+
+def statistics_path(model_path: str | Path, env_name: str) -> Path:
+    """
+    :param model_path: A model saved by our ``train``
+    :param env_name: The environment's name in RL Zoo's folders
+    :return: Where the statistics of its ``VecNormalize`` are: those of a checkpoint beside it, those of the final and of the
+        best model in the folder of the settings
+    """
+    path = Path(model_path)
+    checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", path.stem)
+    if checkpoint is None:
+        return path.parent / env_name / "vecnormalize.pkl"
+    return path.with_name(f"{checkpoint[1]}_vecnormalize_{checkpoint[2]}.pkl")

@@ -1,0 +1,107 @@
+"""The settings of a training run: our YAML files, and what RL Zoo saved beside a model."""
+
+import argparse
+import sys
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
+
+
+def hyperparams_folder() -> Path:
+    """
+    :return: The folder of our YAML files: inside the installed package, at the root of a checkout
+    """
+    package = Path(__file__).parent.parent
+    inside = package / "zoo_hyperparams"
+    return inside if inside.is_dir() else package.parent / "zoo_hyperparams"
+
+
+def read_settings(algo: str) -> dict[str, Any]:
+    """
+    :param algo: Name of the algorithm on the command line
+    :return: The content of its YAML file; empty if there is none
+    """
+    path = hyperparams_folder() / f"{algo}.yml"
+    return yaml.safe_load(path.read_text()) if path.is_file() else {}
+
+
+def settings_file(algo: str, env_id: str) -> Path | None:
+    """
+    :param algo: Name of the algorithm on the command line
+    :param env_id: Environment id
+    :return: Our YAML file, if it has settings for the environment, or defaults for an algorithm that RL Zoo does not have;
+        otherwise None, which leaves it to RL Zoo's settings
+    """
+    settings = read_settings(algo)
+    if env_id in settings or ("default" in settings and not _rl_zoo_has_settings(algo)):
+        return hyperparams_folder() / f"{algo}.yml"
+    return None
+
+
+def _rl_zoo_has_settings(algo: str) -> bool:
+    import rl_zoo3
+
+    return (Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml").is_file()
+
+
+def add_settings_file(arguments: list[str]) -> list[str]:
+    """
+    :param arguments: Arguments of RL Zoo's ``train``
+    :return: The same, with our YAML file where we have one
+    :raises SystemExit: When one of our names has no settings for the environment, or is to be optimised and has nothing to
+        search
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo", default="ppo")
+    parser.add_argument("--env", default="CartPole-v1")
+    parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    given, _ = parser.parse_known_args(arguments)
+    method = BY_ALGO.get(given.algo)
+    if given.optimize_hyperparameters and method is not None and method.is_related and not method.grid:
+        base = base_algo(method)
+        sys.exit(
+            f"-optimize: {given.algo} has no hyperparameters of its own to search. "
+            f"Those of {base} are searched by --algo {base} -optimize."
+        )
+    path = settings_file(given.algo, given.env)
+    if path is not None:
+        # First, so that a file given by the user wins
+        return ["--conf-file", str(path), *arguments]
+    if given.conf_file is None and method is not None and not _rl_zoo_has_settings(given.algo):
+        covered = [key for key in read_settings(given.algo) if not key.endswith("-defaults")]
+        has = f"only for {', '.join(covered)}" if covered else "and for no other"
+        sys.exit(
+            f"{given.algo}.yml has no settings for {given.env}, {has}. "
+            "For another environment, give a YAML file of your own: -conf FILE"
+        )
+    return arguments
+
+
+def base_algo(method: Method) -> str:
+    """
+    :param method: A related method
+    :return: Name of its algorithm on the command line, without the method
+    """
+    return next(row.algo for row in REGISTRY if row.algorithm is method.algorithm and not row.is_related)
+
+
+class SettingsLoader(yaml.FullLoader):
+    """
+    Reads the ``args.yml`` and ``config.yml`` that RL Zoo wrote, and calls nothing that they name: plain values, tuples,
+    ``OrderedDict``, and names of classes that are already imported. ``yaml.YAMLError`` for all else.
+    """
+
+
+def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict:
+    if not isinstance(node, yaml.SequenceNode):
+        raise yaml.constructor.ConstructorError(None, None, "an OrderedDict must be a list of pairs", node.start_mark)
+    (pairs,) = loader.construct_sequence(node, deep=True) or ([],)
+    return OrderedDict(pairs)
+
+
+SettingsLoader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered_dict)
