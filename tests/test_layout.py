@@ -44,7 +44,9 @@ def imported_names(statement: ast.Import | ast.ImportFrom) -> list[str]:
         return [alias.name for alias in statement.names]
     assert statement.level == 0, "Write absolute imports"
     # `from package import module` imports the module
-    return [name if (name := f"{statement.module}.{alias.name}") in modules() else statement.module for alias in statement.names]
+    return [
+        name if (name := f"{statement.module}.{alias.name}") in modules() else statement.module for alias in statement.names
+    ]
 
 
 @cache

@@ -118,7 +118,12 @@ def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _observation_shape(env_id: str) -> tuple[int, ...]:
-    env = ContinualEnv([env_id], 1)
+    try:
+        env = ContinualEnv([env_id], 1)
+    except ImportError as error:
+        if "Box2D" in str(error):
+            raise ImportError(f'{env_id} needs Box2D: pip install "sb3-cchain[box2d]"') from error
+        raise
     env.close()
     if not isinstance(env.observation_space, spaces.Box):
         raise ValueError(f"`env_id` must be an environment with Box observations; {env_id!r} has {env.observation_space}")

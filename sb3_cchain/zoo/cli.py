@@ -9,16 +9,11 @@ import sys
 import warnings
 from typing import Any
 
+import rl_zoo3.train
 import yaml
+from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
-try:
-    import rl_zoo3.cli
-    import rl_zoo3.train
-    from rl_zoo3 import ALGOS
-except ImportError as error:
-    raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
 from sb3_cchain.checkpoint import check_model_file
 from sb3_cchain.methods.registry import REGISTRY
@@ -102,7 +97,29 @@ def main() -> None:
         else:
             if command == "train":
                 sys.argv[2:] = add_settings_file(sys.argv[2:])
-            rl_zoo3.cli.main()
+            run_script(command)
+
+
+def run_script(name: str) -> None:
+    """
+    Run a command of RL Zoo's console script with the arguments in ``sys.argv``. ``rl_zoo3.cli`` would import the libraries
+    that draw for every command.
+
+    :param name: Name of the command, which is also ``sys.argv[1]``
+    :raises ImportError: When the command draws and the libraries for it are not installed
+    """
+    del sys.argv[1]
+    if name == "train":
+        from rl_zoo3.train import train as run
+    elif name == "enjoy":
+        from rl_zoo3.enjoy import enjoy as run
+    else:
+        try:
+            from rl_zoo3 import plots
+        except ImportError as error:
+            raise ImportError(f'{name} needs the libraries that draw ({error}): pip install "sb3-cchain[plots]"') from error
+        run = getattr(plots, name)
+    run()
 
 
 def run_module(name: str) -> None:
