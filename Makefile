@@ -4,28 +4,31 @@ VENV = .venv
 BIN = $(VENV)/bin
 SOURCES = sb3_cchain benchmarks tests
 SUITE = gym_control
-# Extras that the demo, the tests and the benchmarks need
-EXTRAS = dev
+# What the demo needs: its own extra and, elsewhere than in Gym Control, that of the suite. `dev` holds all of them
+DEMO_EXTRAS = $(if $(wildcard $(VENV)/.installed-dev),dev,$(if $(filter gym_control,$(SUITE)),demo,demo,$(SUITE)))
 
 .PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc clean
 
 # --- The two commands of the README -------------------------------------------------------------------------------------
 
-demo: install
+demo: $(VENV)/.installed-$(DEMO_EXTRAS)
 	$(BIN)/python -m benchmarks.demo --suite $(SUITE) $(ARGS)
 
 test: lint check-codestyle type pytest
 
-# --- Set-up: a second call installs nothing again ---------------------------------------------------------------------------
+# --- Set-up: a second call installs nothing again -----------------------------------------------------------------------
 
-install: $(VENV)/.installed
+install: $(VENV)/.installed-dev
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(BIN)/python:
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 10))" || { echo "Python 3.10 or later is needed: make PYTHON=python3.11 ..."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
+
+# The package with the extras that the target is named after
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch hatchling editables
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[$(EXTRAS)]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[$*]"
 	@touch $@
 
 # --- Named as in Stable-Baselines3 --------------------------------------------------------------------------------------
@@ -52,8 +55,7 @@ type: install
 
 commit-checks: format type lint
 
-doc: install
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[docs]"
+doc: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W -b html docs docs/_build/html
 
 clean:
