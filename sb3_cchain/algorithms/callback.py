@@ -103,3 +103,28 @@ class CChainCallback(FiniteCheck):
     def _on_step(self) -> bool:
         super()._on_step()
         if self.reset_churn_coef and self._task_switch.happened(step_task(self.model, self.locals["infos"])):
+            self.churn_reducer.coefficient.reset()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.churn_reducer.coefficient.is_zero:
+            return
+        train, not_saved = self.model.train, [*self.model._excluded_save_params(), *REPLACED]
+
+        def train_once() -> None:
+            self._on_training_end()  # first, so that it is gone when train() fails, too
+            if self.model.start_time != self._start_time:
+                # Left from a learn() that was interrupted between the end of a rollout and train()
+                train()
+                return
+            with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
+                train()
+            self._state.n_updates = self.model._n_updates
+
+        self.model.train = train_once  # type: ignore[method-assign]
+        # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
+        self.model._excluded_save_params = lambda: not_saved  # type: ignore[method-assign]
+
+    def _on_training_end(self) -> None:
+        for name in REPLACED:
+            vars(self.model).pop(name, None)
