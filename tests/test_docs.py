@@ -1,0 +1,193 @@
+"""
+What README and documentation show works as it stands there.
+
+Two things are shortened. Every number from 10 000 on, such as the length of a training, becomes 256; and a rollout has 128
+steps. Python snippets of a page run in order and share their names.
+"""
+
+import argparse
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from rl_zoo3.train import train
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.zoo import cli
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("[!_]*.md"), *(ROOT / "docs").glob("*/*.md")])
+
+# What a page leaves to the reader: a training loop, an environment
+GIVEN = {
+    "docs/modules/churn.md": """
+import torch
+network = torch.nn.Linear(2, 3)
+optimizer = torch.optim.Adam(network.parameters())
+loss_fn = torch.nn.CrossEntropyLoss()
+batches = [(torch.randn(8, 2), torch.randint(3, (8,)), torch.randn(8, 2)) for _ in range(3)]
+references = (torch.randn(8, 2) for _ in range(100))
+def somebody_elses_training_loop(*args):
+    for batch, target, _ in batches:
+        optimizer.zero_grad()
+        loss_fn(network(batch), target).backward()
+        optimizer.step()
+""",
+    "docs/environments.md": "def make_heavier_cartpole(): return __import__('gymnasium').make('CartPole-v1')",
+}
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def snippets(page: Path, language: str) -> list[str]:
+    """The code blocks of a page in a language; those inside of lists without their indentation."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indentation}", "", code, flags=re.MULTILINE) for indentation, code in found]
+
+
+def pages_with(language: str) -> list[Path]:
+    return [page for page in PAGES if snippets(page, language)]
+
+
+def shorten(code: str) -> str:
+    return re.sub(r"\b\d[\d_]{4,}\b", "256", code)
+
+
+def test_shortens_large_numbers_alone():
+    assert shorten("learn(640_000, n_steps=9999), 10000, x_100000, 1e5") == "learn(256, n_steps=9999), 256, x_100000, 1e5"
+
+
+@pytest.fixture
+def short_rollouts(tmp_path, monkeypatch):
+    """Rollouts of 128 steps, in a folder of their own."""
+    init = OnPolicyAlgorithm.__init__
+
+    def init_short(self, policy, env, *args, **kwargs):
+        n_envs = getattr(env, "num_envs", 1)
+        init(self, policy, env, *args, **{**kwargs, "n_steps": max(128 // n_envs, 1)})
+
+    monkeypatch.setattr(OnPolicyAlgorithm, "__init__", init_short)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
+def test_python_runs(page, short_rollouts):
+    names: dict = {}
+    exec(GIVEN.get(name_of(page), ""), names)
+    for code in snippets(page, "python"):
+        exec(compile(shorten(code), name_of(page), "exec"), names)
+
+
+def test_the_readme_goes_on_where_the_model_was(short_rollouts):
+    (code,) = snippets(ROOT / "README.md", "python")
+    names: dict = {}
+    exec(shorten(code), names)
+    assert names["model"].num_timesteps == 512
+    assert list(short_rollouts.glob("runs/CChainPPO_1/events*")) and (short_rollouts / "acrobot.zip").exists()
+
+
+YAML = [pytest.param(code, id=f"{name_of(page)}-{i}") for page in PAGES for i, code in enumerate(snippets(page, "yaml"))]
+
+
+@pytest.mark.parametrize("code", YAML)
+def test_yaml_trains_with_the_stock_rl_zoo(code, short_rollouts, monkeypatch):
+    settings = yaml.safe_load(code)
+    if not any("/" in key for key in settings):  # not an entry but a part of one
+        settings = {"Continual/Acrobot-v1": {"n_timesteps": 256, "policy": "MlpPolicy", **settings}}
+        code = yaml.safe_dump(settings)
+    Path("settings.yml").write_text(code)
+    for env_id in settings:
+        is_dqn = "MinAtar" in env_id
+        arguments = [
+            *("--algo", "dqn" if is_dqn else "ppo", "--env", env_id, "--gym-packages", "sb3_cchain"),
+            *("-conf", "settings.yml", "-f", "logs", "--eval-freq", "-1", "--verbose", "0", "--device", "cpu"),
+            *(("-n", "100", "-params", "buffer_size:1000") if is_dqn else ("-n", "128")),
+        ]
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        train()
+    assert list(short_rollouts.glob("logs/*/*/Continual-*.zip"))
+
+
+class ParsedError(Exception):
+    """The command line was understood."""
+
+
+COMMANDS = [
+    pytest.param(shlex.split(command, comments=True), id=command.split("#")[0].strip())
+    for command in sorted(
+        {
+            line.strip()
+            for page in PAGES
+            for code in snippets(page, "bash")
+            for line in code.replace("\\\n", " ").splitlines()
+            if re.match(r"\s*(sb3-cchain|make|\S*python -m (benchmarks|rl_zoo3))\b", line)
+        }
+    )
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_is_understood(command, monkeypatch):
+    parse_args = argparse.ArgumentParser.parse_args
+
+    def parse_and_stop(self, *args, **kwargs):
+        parse_args(self, *args, **kwargs)
+        raise ParsedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
+    if command[0] == "make":
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+        assert {argument for argument in command[1:] if "=" not in argument} <= set(targets)
+    elif command[0] == "sb3-cchain":
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(ParsedError):
+            cli.main()
+    else:
+        monkeypatch.setattr(sys, "argv", command[2:])
+        with pytest.raises(ParsedError):
+            runpy.run_module(command[2], run_name="__main__", alter_sys=True)
+
+
+def without_code(page: Path) -> str:
+    return re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """Those of the headings of a page."""
+    titles = re.findall(r"^#+ (.*)$", without_code(page), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+ALL_PAGES = [*PAGES, ROOT / "CHANGELOG.md"]
+
+
+@pytest.mark.parametrize("page", ALL_PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(page)):
+        if target.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = target.partition("#")
+        linked = (page.parent / path).resolve() if path else page
+        assert linked.exists(), target
+        assert not anchor or anchor in anchors(linked), target
+
+
+@pytest.mark.parametrize("page", ALL_PAGES, ids=name_of)
+def test_lines_are_wrapped(page):
+    for line in without_code(page).splitlines():
+        is_link_alone = re.fullmatch(r"[\W\d]*\[?!?\[[^\]]*\]\([^)]*\)\S*", line.strip())
+        assert len(line) <= 120 or line.lstrip().startswith(("|", "$$")) or is_link_alone, line
+
+
+def test_every_page_is_reached_from_the_index():
+    index = (ROOT / "docs" / "index.md").read_text()
+    for page in PAGES:
+        if page.is_relative_to(ROOT / "docs") and page.name != "index.md":
+            assert f"({page.relative_to(ROOT / 'docs')})" in index, page
