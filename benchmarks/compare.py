@@ -1,6 +1,6 @@
 """
-Vanilla, C-CHAIN and the related methods in an environment of the paper, under the shipped hyperparameters: trains, and writes
-a table and learning curves. The same command goes on where it was interrupted.
+Methods side by side in an environment of the paper, under the shipped hyperparameters: trains, and writes a table and learning
+curves. The same command goes on where it was interrupted.
 
     python -m benchmarks.compare --suite gym_control --env Continual/Acrobot-v1 --n-tasks 4 --steps-per-task 64000 --seeds 0 1
     python -m benchmarks.compare --suite minatar --steps-per-task 100000 --eval-freq 10000 --seeds 0 1
@@ -9,17 +9,21 @@ a table and learning curves. The same command goes on where it was interrupted.
 import argparse
 from pathlib import Path
 
-from benchmarks.curves import report
-from benchmarks.runs import complete
-from benchmarks.suites import SUITES, look_at
+from benchmarks.grid.executor import train_all
+from benchmarks.grid.run import make_run, suite_methods
+from benchmarks.grid.suites import SUITES, paper_length
+from benchmarks.report.figures import plot_learning_curves
+from benchmarks.report.markdown import markdown_table
+from benchmarks.report.random_policy import look_at_task
+from benchmarks.report.task_tables import average_cells, cost_table, mean_rows, returns_header, returns_rows
 
 
 def main() -> None:
-    """Parse the command line, train, report."""
+    """Parse the command line, train, write and print the tables and the curves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", required=True, choices=list(SUITES), help="Suite")
     parser.add_argument("--env", help="Environment id, by default the suite's first")
-    parser.add_argument("--algo", nargs="+", help="Algorithms, by default Vanilla and C-CHAIN")
+    parser.add_argument("--method", nargs="+", default=["vanilla", "cchain"], help="Methods, by default Vanilla and C-CHAIN")
     parser.add_argument(
         "--seeds", nargs="+", type=int, default=[0, 1, 2], help="Seeds of agents, and of Gym Control's offsets"
     )
@@ -30,27 +34,32 @@ def main() -> None:
     )
     parser.add_argument("--random-episodes", type=int, default=50, help="Episodes of the random policy in each task")
     parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
-    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the runs")
+    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
     args = parser.parse_args()
 
-    suite = SUITES[args.suite]
-    env_id = args.env or suite.env_ids[0]
-    algos = args.algo or list(suite.algos)
-    if env_id not in suite.env_ids:
-        parser.error(f"--env must be one of {', '.join(suite.env_ids)}; got {env_id}")
-    if not set(algos) <= {*suite.algos, *suite.others}:
-        parser.error(f"--algo must be of {', '.join([*suite.algos, *suite.others])}; got {' '.join(algos)}")
-    length = suite.length(env_id)
-    n_tasks, steps_per_task = args.n_tasks or length[0], args.steps_per_task or length[1]
-    folder = args.output / args.suite / f"{env_id.replace('/', '-')}_{n_tasks}x{steps_per_task}"
-    runs = [
-        suite.run(algo, env_id, seed, n_tasks, steps_per_task, folder / f"{algo}_seed{seed}", args.eval_freq)
-        for seed in args.seeds
-        for algo in algos
-    ]
-    complete(runs, args.jobs)
-    tasks = [look_at(suite, runs[0], task, args.random_episodes) for task in range(n_tasks)]
-    report(suite, runs, folder, tasks)
+    env_id = args.env or SUITES[args.suite].env_ids[0]
+    try:
+        paper = paper_length(env_id)
+        n_tasks, steps = args.n_tasks or paper[0], args.steps_per_task or paper[1]
+        experiment = f"compare_{n_tasks}x{steps}"
+        runs = [
+            make_run(args.suite, env_id, method, seed, n_tasks, steps, experiment, args.eval_freq)
+            for seed in args.seeds
+            for method in args.method
+        ]
+    except ValueError as error:
+        parser.error(str(error))
+    results = train_all(runs, args.output, args.jobs)
+
+    lines = suite_methods(args.suite)
+    looks = [look_at_task(runs[0], task, args.random_episodes) for task in range(n_tasks)]
+    rows = [*returns_rows(results, lines), *mean_rows(results, lines)]
+    rows.append(["random policy", "", *average_cells([look.random_return for look in looks])])
+    tables = f"{markdown_table(returns_header(results[0].task_names), rows)}\n\n{cost_table(results, lines)}"
+    folder = results[0].path.parents[1]
+    (folder / "table.md").write_text(tables + "\n")
+    plot_learning_curves(results, folder / "curves.png", lines, env_id, looks)
+    print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
-from benchmarks.deepcopy_ppo import DeepCopyPPO
+from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainPPO
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import policy_outputs

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from benchmarks.deepcopy_dqn import DeepCopyDQN
+from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from sb3_cchain import CChainDQN, DoubleDQN
 from sb3_cchain.algorithms import off_policy
 from tests.envs import RandomEnv

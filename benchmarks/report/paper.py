@@ -6,7 +6,7 @@ from pathlib import Path
 
 TABLES = Path(__file__).with_name("paper_tables.csv")
 
-# The row of a suite's table that sums up its environments
+# Name of the row that sums up a suite's environments
 AGGREGATE = "aggregate"
 
 

@@ -1,4 +1,4 @@
-"""The live view of a grid."""
+"""The live view of runs that are being executed."""
 
 import math
 import platform
@@ -13,7 +13,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from benchmarks.grid import GridRun, Rates
+from benchmarks.grid.plan import Rates
+from benchmarks.grid.run import Run
 
 
 class Failure(NamedTuple):
@@ -23,10 +24,10 @@ class Failure(NamedTuple):
     :param run: The run
     :param reason: In one line
     :param log: Path of its log, or of the folder of its logs
-    :param node: Name of the machine that it is on, None where that is not known
+    :param node: Name of the machine that the log is on, None where that is not known
     """
 
-    run: GridRun
+    run: Run
     reason: str
     log: str
     node: str | None = None
@@ -39,7 +40,7 @@ class Failure(NamedTuple):
 def duration(seconds: float) -> str:
     """
     :param seconds: A duration
-    :return: For people, in two figures or so
+    :return: Human-readable, in about two digits
     """
     if seconds < 60:
         return f"{math.ceil(seconds)} s"
@@ -48,51 +49,52 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds < 72 * 3600 else f"{seconds / 86400:.0f} days"
 
 
-class GridView:
+class View:
     """
-    What is done, running, waiting and failed of a grid, and how long the rest will take. Ends and failures of runs are printed
-    in lines of their own, which a log file gets, too; the view itself is for a terminal.
+    Which runs are done, running, waiting and failed, and how long the rest will take. Each end and failure of a run is printed
+    on a line of its own, also into a log file; the view itself is for a terminal.
 
     :param waiting: The runs that are not done, in their order
-    :param n_done: How many are done already
-    :param rates: What is known of their speed
-    :param console: Where to
+    :param n_done: Number of runs that are done already
+    :param rates: What is known about their speed
+    :param console: Where the view is shown
     """
 
-    def __init__(self, waiting: Sequence[GridRun], n_done: int, rates: Rates, console: Console):
+    def __init__(self, waiting: Sequence[Run], n_done: int, rates: Rates, console: Console):
         self.waiting = list(waiting)
-        self.running: dict[GridRun, float] = {}
+        self.running: dict[Run, float] = {}
         self.failures: list[Failure] = []
         self.n_before, self.n_done = n_done, n_done
         self.slots = 1
+        self.progress: dict[Run, str] = {}
         self._rates = rates
-        # Seconds of the runs of this grid that came to their end: believed, and real
-        self._believed, self._real = 0.0, 0.0
+        # Seconds of the runs that have finished here: estimated, and real
+        self._estimated, self._real = 0.0, 0.0
         self.console = console
         self.live = Live(console=console, get_renderable=self.render, refresh_per_second=1, transient=True)
 
-    def start(self, run: GridRun) -> None:
+    def start(self, run: Run) -> None:
         """
-        :param run: Runs from now on
+        :param run: Run that was started
         """
         self.waiting.remove(run)
         self.running[run] = time.monotonic()
 
-    def skip(self, run: GridRun) -> None:
+    def skip(self, run: Run) -> None:
         """
-        :param run: Was done by another process
+        :param run: Run that another process has done
         """
         self.waiting.remove(run)
         self.n_done += 1
 
-    def finish(self, run: GridRun, seconds: float) -> None:
+    def finish(self, run: Run, seconds: float) -> None:
         """
-        :param run: Came to its end
-        :param seconds: That it took
+        :param run: Run that has finished
+        :param seconds: Seconds that it took
         """
         del self.running[run]
         self.n_done += 1
-        self._believed += self._rates.seconds(run)
+        self._estimated += self._rates.seconds(run)
         self._real += seconds
         total = self.n_done + len(self.running) + len(self.waiting) + len(self.failures)
         left = f", {duration(self.time_left())} left" if self.running or self.waiting else ""
@@ -102,8 +104,8 @@ class GridView:
 
     def fail(self, failure: Failure, again: bool) -> None:
         """
-        :param failure: Of a run
-        :param again: Whether it is tried again
+        :param failure: Failure of a run
+        :param again: Whether the run is tried again
         """
         del self.running[failure.run]
         if again:
@@ -115,20 +117,20 @@ class GridView:
 
     def time_left(self) -> float:
         """
-        :return: Seconds: what the rest is believed to take, corrected by how long the finished runs of this grid really took,
-            and divided by the number that runs at a time
+        :return: Seconds: the estimate of the rest, corrected by how long the runs that finished here really took, and divided
+            by the number of runs at a time
         """
-        factor = self._real / self._believed if self._believed else 1.0
+        factor = self._real / self._estimated if self._estimated else 1.0
         now = time.monotonic()
-        # Copies, for the view is drawn by a thread of its own
+        # Copies, because the view is drawn by a thread of its own
         running = [max(factor * self._rates.seconds(run) - (now - start), 0.0) for run, start in list(self.running.items())]
         waiting = [factor * self._rates.seconds(run) for run in list(self.waiting)]
-        # The longest of those running is the least that it can be
+        # No shorter than the longest of those running
         return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
 
     def render(self) -> RenderableType:
         """
-        :return: The view at this moment
+        :return: The view now
         """
         total = self.n_done + len(self.running) + len(self.waiting) + len(self.failures)
         counts = Text.assemble(
@@ -139,9 +141,9 @@ class GridView:
         now = time.monotonic()
         running = Table.grid(padding=(0, 2))
         for run, start in list(self.running.items())[:20]:
-            running.add_row("", run.name, duration(now - start))
+            running.add_row("", run.name, duration(now - start), self.progress.get(run, ""))
         if len(self.running) > 20:
-            running.add_row("", f"and {len(self.running) - 20} more", "")
+            running.add_row("", f"and {len(self.running) - 20} more")
         failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]
         head = Table.grid(padding=(0, 1))
         head.add_row(ProgressBar(total=max(total, 1), completed=self.n_done, width=20), counts)

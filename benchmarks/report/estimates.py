@@ -1,4 +1,4 @@
-"""What is said of a method from a few seeds: pure functions on scores, where greater is better."""
+"""Statistics of a few seeds: pure functions of scores, where greater is better."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ METRICS: dict[str, Callable[[np.ndarray], float]] = {
     "optimality gap": metrics.aggregate_optimality_gap,
 }
 
-# Of rliable's bootstrap over seeds, stratified by environment
+# Resamples of rliable's bootstrap over seeds, stratified by environment
 N_RESAMPLES = 2000
 
 Interval = tuple[float, float]
@@ -22,7 +22,7 @@ Interval = tuple[float, float]
 def mean_and_error(scores: Sequence[float]) -> tuple[float, float | None]:
     """
     :param scores: One score per seed
-    :return: Mean, and its standard error (standard deviation with n - 1, over √n), None of a single seed
+    :return: Mean, and its standard error (standard deviation with n - 1, over √n), None for a single seed
     """
     error = float(np.std(scores, ddof=1) / np.sqrt(len(scores))) if len(scores) > 1 else None
     return float(np.mean(scores)), error
@@ -30,13 +30,13 @@ def mean_and_error(scores: Sequence[float]) -> tuple[float, float | None]:
 
 def bootstrap_interval(scores: Sequence[float], n_resamples: int = 10_000, level: float = 0.95) -> Interval | None:
     """
-    Percentile bootstrap of the mean. Of three seeds or fewer it reaches from the lowest to the highest, as each of these alone
-    makes up more than 2.5 % of the resamples.
+    Percentile bootstrap of the mean. With three seeds or fewer it reaches from the lowest to the highest, because
+    each of these alone makes up more than 2.5 % of the resamples.
 
     :param scores: One score per seed
     :param n_resamples: Resamples, always the same ones
     :param level: Share of the resamples' means that lies in the interval
-    :return: Its ends, None of a single seed
+    :return: Its ends, None for a single seed
     """
     if len(scores) < 2:
         return None
@@ -47,7 +47,7 @@ def bootstrap_interval(scores: Sequence[float], n_resamples: int = 10_000, level
 
 def agrees(interval: Interval, mean: float, standard_error: float) -> bool:
     """
-    :param interval: Interval of our mean
+    :param interval: Interval of the mean here
     :param mean: Mean in the paper
     :param standard_error: Its standard error
     :return: Whether the interval overlaps the paper's mean ± 2 standard errors
@@ -58,8 +58,8 @@ def agrees(interval: Interval, mean: float, standard_error: float) -> bool:
 def best_two(means: Mapping[str, float]) -> dict[str, str]:
     """
     :param means: Mean of each method
-    :return: ``"best"`` and ``"second"`` by method. As in the paper, the Oracle does not compete, of two methods there is no
-        second, and of one no best
+    :return: ``"best"`` and ``"second"`` by method. As in the paper, the Oracle does not compete, two methods have no second,
+        and a single one is no best
     """
     competing = {method: mean for method, mean in means.items() if method != "oracle"}
     marks = ["best", "second"][: len(competing) - 1]
@@ -70,8 +70,8 @@ def best_two(means: Mapping[str, float]) -> dict[str, str]:
 def normalized(scores: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """
     :param scores: ``(n_seeds, n_environments)``
-    :param low: What becomes 0, ``(n_environments,)``
-    :param high: What becomes 1, ``(n_environments,)``
+    :param low: Score that becomes 0, ``(n_environments,)``
+    :param high: Score that becomes 1, ``(n_environments,)``
     :return: ``(n_seeds, n_environments)``
     """
     return (scores - low) / (high - low)
@@ -85,8 +85,8 @@ def reliable_metrics(scores: Mapping[str, np.ndarray]) -> tuple[dict[str, np.nda
     :return: By method, ``METRICS``, ``(4,)``, and ends of their 95 % intervals, ``(2, 4)``
     """
 
-    def compute(of_method: np.ndarray) -> np.ndarray:
-        return np.array([metric(of_method) for metric in METRICS.values()])
+    def compute(method_scores: np.ndarray) -> np.ndarray:
+        return np.array([metric(method_scores) for metric in METRICS.values()])
 
     with _seeded():
         return library.get_interval_estimates(dict(scores), compute, reps=N_RESAMPLES)
@@ -96,8 +96,8 @@ def probability_of_improvement(scores: Mapping[str, np.ndarray], method: str) ->
     """
     :param scores: Scores of each method, ``(n_seeds, n_environments)``
     :param method: One of them
-    :return: For each other method, the probability that a run of ``method`` scores higher than one of it, a tie being a half,
-        mean over the environments; and the 95 % interval
+    :return: For each other method, the probability that a run of ``method`` scores higher than one of the other, a tie
+        counting as a half, mean over the environments; and the 95 % interval
     """
     pairs = {other: (scores[method], scores[other]) for other in scores if other != method}
     with _seeded():

@@ -1,52 +1,37 @@
-"""
-What the runs of a budget say beside the paper's numbers: tables, learning curves, rliable's metrics and NTK figures, as
-``report.md`` with pictures and as ``report.html``, one page that needs nothing beside it.
+"""The report: sections of a suite, and the page as a whole."""
 
-    python -m benchmarks.report --budget reduced
-"""
-
-import argparse
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cells import Cells, cells_of, in_words
-from benchmarks.curves import LABELS
-from benchmarks.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
-from benchmarks.figures import plot_learning_curves, plot_ntk, plot_reliable_metrics
-from benchmarks.markdown import markdown_table
-from benchmarks.page import html_page
-from benchmarks.paper import AGGREGATE, Table, read_tables
-from benchmarks.quantities import NTK
-from benchmarks.results import METHODS, Result, in_json, read_results
-from benchmarks.runs import shipped_hyperparameters
-from benchmarks.suites import SUITES
-from benchmarks.tables import (
-    MISSING,
-    digits_of,
-    label_of,
+from benchmarks.grid.results import Result
+from benchmarks.grid.run import as_json, shipped_hyperparameters, short_name, suite_methods
+from benchmarks.grid.suites import SUITES
+from benchmarks.report.cells import Cells, make_cells, versions_text
+from benchmarks.report.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
+from benchmarks.report.figures import plot_learning_curves, plot_quantities, plot_reliable_metrics
+from benchmarks.report.markdown import code, escaped, markdown_table
+from benchmarks.report.page import html_page
+from benchmarks.report.paper import AGGREGATE, Table, read_tables
+from benchmarks.report.quantities import NTK
+from benchmarks.report.tables import (
     lengths_table,
-    listed,
     mark_differences,
-    methods_of,
-    name_of,
-    ntk_table,
+    method_label,
     results_table,
     score_matrices,
-    tasks_table,
+    table_digits,
+    table_methods,
 )
+from benchmarks.report.task_tables import MISSING, quantities_table, returns_header, returns_rows, seeds_text
+from sb3_cchain.methods.registry import METHOD_NAMES
 
-TITLES = {
-    "gym_control": "Continual Gym Control",
-    "procgen": "Continual ProcGen",
-    "dmc": "Continual DeepMind Control",
-    "minatar": "Continual MinAtar",
-}
 PICTURES = "pictures"
 
-INTRODUCTION = """# The paper's tables, reproduced: budget `{budget}`
+INTRODUCTION = """# The paper's tables, reproduced: budget {budget}
 
 The numbers of this page are made from {n_runs} finished runs{seeds}, beside those printed in *Mitigating Plasticity Loss in
 Continual Reinforcement Learning by Reducing Churn* (Tang et al., ICML 2025). Every finished run of this budget that is in
@@ -101,56 +86,89 @@ means over the logs of a task and over the seeds. In the pictures, the mean over
 with a band of ± one standard error."""
 
 
-def write_report(results: Sequence[Result], budget: str, folder: Path) -> None:
+def write_report(results: Sequence[Result], experiment: str, folder: Path, left_out: Sequence[str] = ()) -> list[str]:
     """
     Write ``report.md``, its pictures and ``report.html``.
 
-    :param results: Finished runs of one budget
-    :param budget: Its name
-    :param folder: Where they go
-    :raises ValueError: When runs are not comparable (:func:`benchmarks.cells.cells_of`), or of an environment that the paper
-        does not have
+    :param results: Finished runs of one experiment
+    :param experiment: Its name: the budget
+    :param folder: Where the report goes
+    :param left_out: Runs that cannot be read, and why, in one line each
+    :return: These and further runs that are left out, and why
+    :raises ValueError: When runs are not comparable (:func:`benchmarks.report.cells.make_cells`)
     """
     tables = read_tables()
+    by_suite: dict[str, list[Result]] = {suite: [] for suite in tables}
+    left_out = list(left_out)
     for result in results:
-        if result.suite not in tables or result.env_id not in tables[result.suite].lengths:
-            raise ValueError(f"The paper has no {result.env_id} in suite {result.suite!r}: {result.path}")
-    (folder / PICTURES).mkdir(parents=True, exist_ok=True)
-    by_suite = {suite: [result for result in results if result.suite == suite] for suite in tables}
-    sections = [_suite_section(suite, runs, tables[suite], folder) for suite, runs in by_suite.items() if runs]
-    without = [TITLES[suite] for suite, runs in by_suite.items() if not runs]
-    suites = [f"- [{TITLES[suite]}](#{TITLES[suite].lower().replace(' ', '-')})" for suite, runs in by_suite.items() if runs]
-    if without:
-        suites.append(f"- Not run: {', '.join(without)}.")
+        if result.env_id not in tables[result.suite].lengths:
+            left_out.append(f"{result.path}: the paper has no {result.env_id} in {result.suite}")
+        elif result.variant is not None or result.overrides:
+            left_out.append(f"{result.path}: not under the shipped hyperparameters, but with {', '.join(result.overrides)}")
+        else:
+            by_suite[result.suite].append(result)
+    results = [result for runs in by_suite.values() for result in runs]
+    if not results:
+        raise ValueError("; ".join(["No run is left for the report", *left_out]))
+    pictures = _Pictures(folder)
+    sections = [_suite_section(suite, runs, tables[suite], pictures) for suite, runs in by_suite.items() if runs]
+    titles = {suite: SUITES[suite].title for suite in by_suite}
+    contents = [f"- [{titles[suite]}](#{titles[suite].lower().replace(' ', '-')})" for suite, runs in by_suite.items() if runs]
+    if missing := [titles[suite] for suite, runs in by_suite.items() if not runs]:
+        contents.append(f"- Not run: {', '.join(missing)}.")
     n_seeds = len({result.seed for result in results})
     introduction = INTRODUCTION.format(
-        budget=budget,
+        budget=code(experiment),
         n_runs=len(results),
         seeds=f" of {n_seeds} seeds" if n_seeds > 1 else " of a single seed",
-        suites="\n".join(suites),
+        suites="\n".join(contents),
         missing=MISSING,
     )
-    markdown = "\n\n".join([introduction, *sections, _runs_section(results, budget)]) + "\n"
+    markdown = "\n\n".join([introduction, *sections, _runs_section(results, experiment, left_out)]) + "\n"
     (folder / "report.md").write_text(markdown)
-    (folder / "report.html").write_text(html_page(markdown, folder))
+    (folder / "report.html").write_text(html_page(markdown, pictures.drawn))
+    return left_out
 
 
-def _suite_section(suite: str, results: Sequence[Result], paper: Table, folder: Path) -> str:
-    """All that is said of a suite."""
-    cells, left_out = cells_of(results)
-    parts = [f"## {TITLES[suite]}", lengths_table(results, paper), results_table(suite, cells, paper)]
+class _Pictures:
+    """
+    The pictures of a report.
+
+    :param folder: Folder of the report
+    """
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self.drawn: dict[str, Path] = {}
+        (folder / PICTURES).mkdir(parents=True, exist_ok=True)
+
+    def add(self, name: str, alternative: str) -> tuple[Path, str]:
+        """
+        :param name: Name of a picture that is about to be drawn
+        :param alternative: Alternative text
+        :return: Its path, and the Markdown that shows it
+        """
+        relative = f"{PICTURES}/{name}.png"
+        self.drawn[relative] = self._folder / relative
+        return self.drawn[relative], f"![{alternative}]({relative})"
+
+
+def _suite_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> str:
+    """The section of a suite."""
+    cells, left_out = make_cells(results)
+    parts = [f"## {SUITES[suite].title}", lengths_table(results, paper), results_table(suite, cells, paper)]
     parts += _notes(suite, cells, paper, left_out)
     if marks := mark_differences(suite, paper):
         parts.append("Where the paper's own marks or sums are not those of its numbers:\n\n" + "\n".join(marks))
     parts += _hyperparameters_section(suite, results, paper)
-    parts += _reliable_section(suite, cells, paper, folder)
-    parts += _curves_section(suite, results, paper, folder)
-    parts += _ntk_section(suite, results, paper, folder)
+    parts += _reliable_section(suite, cells, paper, pictures)
+    parts += _curves_section(suite, results, paper, pictures)
+    parts += _ntk_section(suite, results, paper, pictures)
     return "\n\n".join(parts)
 
 
 def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> list[str]:
-    """How much there is and how much of it agrees, and what is peculiar in it."""
+    """How many cells there are, how many agree with the paper, and what readers should know about them."""
     wanted = {key: figure for key, figure in paper.figures.items() if key[0] != AGGREGATE}
     there = {key: cells[key].interval for key in wanted if key in cells}
     tested = {key: interval for key, interval in there.items() if interval is not None}
@@ -160,8 +178,8 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
         f"{n_agree} agree with the paper."
     ]
     different = [
-        f"- † {name_of(env_id)}, {label_of(suite, method)}: "
-        + "; ".join(f"seeds {listed(seeds)} with {versions}" for versions, seeds in cell.versions)
+        f"- † {short_name(env_id)}, {method_label(suite, method)}: "
+        + "; ".join(f"seeds {seeds_text(seeds)} with {escaped(versions)}" for versions, seeds in cell.versions)
         for (env_id, method), cell in cells.items()
         if len(cell.versions) > 1
     ]
@@ -171,76 +189,75 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
     fewer: dict[str, list[str]] = {}
     for (env_id, method), cell in cells.items():
         if len(cell.seeds) < len(most):
-            fewer.setdefault(listed(cell.seeds), []).append(f"{name_of(env_id)} {label_of(suite, method)}")
+            fewer.setdefault(seeds_text(cell.seeds), []).append(f"{short_name(env_id)} {method_label(suite, method)}")
     if fewer:
         lines = "\n".join(f"- {seeds} alone: {', '.join(names)}" for seeds, names in fewer.items())
-        notes.append(f"Not all of the seeds {listed(most)} finished, for want of time or because they failed:\n\n{lines}")
+        notes.append(f"Not all of the seeds {seeds_text(most)} finished, for want of time or because they failed:\n\n{lines}")
     if left_out:
-        notes.append("Left out, as their J(T) is not defined:\n\n" + "\n".join(f"- {reason}" for reason in left_out))
+        notes.append("Left out, as their J(T) is not defined:\n\n" + "\n".join(f"- {escaped(reason)}" for reason in left_out))
     return notes
 
 
 def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:
-    """What makes a method of Vanilla, as the runs had it; and which had other hyperparameters than are shipped now."""
+    """How each method's settings differ from Vanilla's, and which runs had other hyperparameters than are shipped now."""
+    methods = suite_methods(suite)
     differences: dict[tuple[str, str], list[str]] = {}
     for env_id, runs in _by_env(results, paper).items():
-        vanilla = in_json(shipped_hyperparameters(SUITES[suite].methods["vanilla"], env_id))
+        vanilla = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
         for method, hyperparameters in {run.method: run.hyperparameters for run in runs if run.method != "vanilla"}.items():
-            differing = [f"`{name}: {value}`" for name, value in hyperparameters.items() if vanilla.get(name) != value]
-            key = label_of(suite, method), ", ".join(differing) or "nothing in the settings"
-            differences.setdefault(key, []).append(name_of(env_id))
+            differing = [code(f"{name}: {value}") for name, value in hyperparameters.items() if vanilla.get(name) != value]
+            key = method_label(suite, method), ", ".join(differing) or "nothing in the settings"
+            differences.setdefault(key, []).append(short_name(env_id))
     lines = [f"- {label} ({', '.join(names)}): {differing}" for (label, differing), names in differences.items()]
     parts = [
         "### Hyperparameters",
-        f"What the settings of each method have beside {label_of(suite, 'vanilla')}'s, or instead:",
+        f"What the settings of each method have beside {method_label(suite, 'vanilla')}'s, or instead:",
         "\n".join(lines) if lines else "Nothing else was run.",
     ]
     others = [
-        f"- {name_of(result.env_id)}, {label_of(suite, result.method)}, seed {result.seed}"
+        f"- {short_name(result.env_id)}, {method_label(suite, result.method)}, seed {result.seed}"
         for result in results
-        if result.hyperparameters != in_json(shipped_hyperparameters(result.algo, result.env_id))
+        if result.hyperparameters != as_json(shipped_hyperparameters(result.algo, result.env_id))
     ]
     if others:
         parts += ["**Not under the hyperparameters that are shipped now:**", "\n".join(others)]
     return parts
 
 
-def _reliable_section(suite: str, cells: Cells, paper: Table, folder: Path) -> list[str]:
+def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Pictures) -> list[str]:
     """rliable's metrics over the environments."""
     env_ids, scores, seeds = score_matrices(cells, paper)
     if not {"vanilla", "cchain"} <= set(scores):
         return []
     low, high = (np.array([end(paper.means(env_id).values()) for env_id in env_ids]) for end in (min, max))
-    algos = {method: SUITES[suite].methods[method] for method in scores}
-    estimates, intervals = reliable_metrics({method: normalized(of_method, low, high) for method, of_method in scores.items()})
+    estimates, intervals = reliable_metrics({method: normalized(matrix, low, high) for method, matrix in scores.items()})
     several = [method for method in scores if len(seeds[method]) > 1]
 
     rows = []
-    for method, of_method in estimates.items():
-        figures = [f"{estimate:.2f}" for estimate in of_method]
+    for method, values in estimates.items():
+        figures = [f"{value:.2f}" for value in values]
         if method in several:
             figures = [f"{figure} [{lo:.2f}, {hi:.2f}]" for figure, lo, hi in zip(figures, *intervals[method], strict=True)]
-        rows.append([LABELS[algos[method]], listed(seeds[method]), *figures])
-    without = [label_of(suite, method) for method in methods_of(cells, paper) if method not in scores]
+        rows.append([method_label(suite, method), seeds_text(seeds[method]), *figures])
+    without = [method_label(suite, method) for method in table_methods(cells, paper) if method not in scores]
     words = [
-        f"Over {', '.join(map(name_of, env_ids))}, where Vanilla and C-CHAIN both have runs. "
+        f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and C-CHAIN both have runs. "
         + (f"Left out, as they do not have runs in all of them: {', '.join(without)}. " if without else "")
         + NORMALIZATION
     ]
-    picture = f"{PICTURES}/metrics_{suite}.png"
+    shown = []
     if several:
+        path, picture = pictures.add(f"metrics_{suite}", f"Metrics over the environments of {SUITES[suite].title}")
         plot_reliable_metrics(
-            {method: estimates[method] for method in several},
-            intervals,
-            {method: algos[method] for method in several},
-            folder / picture,
+            {name: estimates[name] for name in several}, intervals, list(METRICS), suite_methods(suite), path
         )
+        shown = [picture]
     header = ["method", "seeds", *METRICS]
     return [
         "### Over the environments",
         *words,
         markdown_table(header, rows),
-        *([f"![Metrics over the environments of {TITLES[suite]}]({picture})"] if several else []),
+        *shown,
         *_improvement(suite, env_ids, scores, several, paper),
     ]
 
@@ -255,11 +272,11 @@ def _improvement(
         if method in several and "cchain" in several:
             text += f" [{interval[0]:.2f}, {interval[1]:.2f}]"
         higher = int((scores["cchain"].mean(axis=0) > scores[method].mean(axis=0)).sum())
-        of_paper = MISSING
+        in_paper = MISSING
         if method in paper.methods:
             means = [paper.means(env_id) for env_id in env_ids]
-            of_paper = f"{sum(mean['cchain'] > mean[method] for mean in means)} of {len(env_ids)}"
-        rows.append([label_of(suite, method), text, f"{higher} of {len(env_ids)}", of_paper])
+            in_paper = f"{sum(mean['cchain'] > mean[method] for mean in means)} of {len(env_ids)}"
+        rows.append([method_label(suite, method), text, f"{higher} of {len(env_ids)}", in_paper])
     header = ["C-CHAIN over", "probability of improvement", "higher mean, here", "higher mean, paper"]
     return [
         IMPROVEMENT,
@@ -267,9 +284,10 @@ def _improvement(
     ]
 
 
-def _curves_section(suite: str, results: Sequence[Result], paper: Table, folder: Path) -> list[str]:
+def _curves_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
     """Learning curves of each environment."""
-    window = 1 if SUITES[suite].evaluates else 5
+    lines = suite_methods(suite)
+    window = SUITES[suite].smoothing
     smooth = f", a running mean over {window} rollouts within a task," if window > 1 else ""
     parts = [
         "### Learning curves",
@@ -277,18 +295,16 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, folder:
         "Dashed: the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
     ]
     for env_id, runs in _by_env(results, paper).items():
-        picture = f"{PICTURES}/curves_{env_id.replace('/', '-')}.png"
-        plot_learning_curves(runs, folder / picture, window, SUITES[suite].own_scales)
-        parts += [
-            f"{name_of(env_id)}:",
-            f"![Learning curves in {name_of(env_id)}]({picture})",
-            tasks_table(runs, digits_of(paper)),
-        ]
+        path, picture = pictures.add(f"curves_{env_id.replace('/', '-')}", f"Learning curves in {short_name(env_id)}")
+        plot_learning_curves(runs, path, lines)
+        table = markdown_table(returns_header(runs[0].task_names), returns_rows(runs, lines, table_digits(paper)))
+        parts += [f"{short_name(env_id)}:", picture, table]
     return parts
 
 
-def _ntk_section(suite: str, results: Sequence[Result], paper: Table, folder: Path) -> list[str]:
+def _ntk_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
     """The neural tangent kernel, of the runs that logged it."""
+    lines = suite_methods(suite)
     logged = [result for result in results if NTK[0].name in result.metrics]
     if not logged:
         return []
@@ -297,9 +313,9 @@ def _ntk_section(suite: str, results: Sequence[Result], paper: Table, folder: Pa
         NTK_WORDS,
     ]
     for env_id, runs in _by_env(logged, paper).items():
-        picture = f"{PICTURES}/ntk_{env_id.replace('/', '-')}.png"
-        plot_ntk(runs, folder / picture)
-        parts += [f"{name_of(env_id)}:", ntk_table(runs), f"![NTK in {name_of(env_id)}]({picture})"]
+        path, picture = pictures.add(f"ntk_{env_id.replace('/', '-')}", f"NTK in {short_name(env_id)}")
+        plot_quantities(runs, path, lines, NTK)
+        parts += [f"{short_name(env_id)}:", quantities_table(runs, lines, NTK), picture]
     return parts
 
 
@@ -308,54 +324,29 @@ def _by_env(results: Sequence[Result], paper: Table) -> dict[str, list[Result]]:
     return {env_id: runs for env_id, runs in by_env.items() if runs}
 
 
-def _runs_section(results: Sequence[Result], budget: str) -> str:
-    """How the runs were made."""
+def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence[str]) -> str:
+    """How the runs were made, and which were left out."""
     hours = sum(result.seconds for result in results) / 3600
-    versions = Counter(in_words(result.versions) for result in results)
+    versions = Counter(versions_text(result.versions) for result in results)
     commits = Counter(result.git_commit or "no checkout" for result in results)
-    counted = [f"- {n} runs with {name}" for name, n in versions.items()] + [
-        f"- {n} runs at {name}" for name, n in commits.items()
-    ]
+    counted = [f"- {n} runs with {escaped(name)}" for name, n in versions.items()]
+    counted += [f"- {n} runs at {escaped(name)}" for name, n in commits.items()]
+    budget = shlex.quote(" ".join(experiment.split()))
     commands = []
     for suite in dict.fromkeys(result.suite for result in results):
-        of_suite = [result for result in results if result.suite == suite]
-        methods = " ".join(method for method in METHODS if any(result.method == method for result in of_suite))
-        n_seeds = 1 + max(result.seed for result in of_suite)
+        runs = [result for result in results if result.suite == suite]
+        methods = " ".join(method for method in METHOD_NAMES if any(run.method == method for run in runs))
+        n_seeds = 1 + max(run.seed for run in runs)
         commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} --method {methods} --seeds {n_seeds}")
     commands.append(f"python -m benchmarks.report --budget {budget}")
-    return "\n\n".join(
-        [
-            "## The runs",
-            f"{len(results)} runs, {hours:.1f} hours of them in total. The `run.json` of each holds its command, "
-            "versions and commit, too.",
-            "\n".join(counted),
-            "The same command makes those that are missing:",
-            "```bash\n" + "\n".join(commands) + "\n```",
-        ]
-    )
-
-
-def main() -> None:
-    """Parse the command line, read, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results"), help="Folder of all results")
-    parser.add_argument("--budget", default="reduced", help="Name of the budget")
-    parser.add_argument("--output", type=Path, help="Folder of the report, by default the budget's in the results")
-    args = parser.parse_args()
-
-    try:
-        results = read_results(args.results)
-        of_budget = [result for result in results if result.budget == args.budget]
-        if not of_budget:
-            budgets = ", ".join(sorted({result.budget for result in results})) or "none"
-            raise ValueError(f"no results of --budget {args.budget} in {args.results}; the budgets there: {budgets}")
-        folder = args.output or args.results / args.budget
-        write_report(of_budget, args.budget, folder)
-    # Damaged results, too, or such as are not comparable
-    except ValueError as error:
-        parser.error(str(error))
-    print(f"Written: {folder}/report.md, {folder}/report.html")
-
-
-if __name__ == "__main__":
-    main()
+    parts = [
+        "## The runs",
+        f"{len(results)} runs, {hours:.1f} hours of them in total. The `run.json` of each holds its command, "
+        "versions and commit, too.",
+        "\n".join(counted),
+        "The same command makes those that are missing:",
+        "```bash\n" + "\n".join(commands) + "\n```",
+    ]
+    if left_out:
+        parts += ["These are left out:", "\n".join(f"- {escaped(reason)}" for reason in left_out)]
+    return "\n\n".join(parts)

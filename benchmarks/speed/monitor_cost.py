@@ -2,8 +2,8 @@
 What the callbacks cost that look at training, each with its defaults: the processor time spent in them as a share of that of
 the rest of the same training. Two trainings, with and without, differ by more than that on a machine that does other things.
 
-    python -m benchmarks.monitor_cost
-    python -m benchmarks.monitor_cost --impala   # one NTK of the IMPALA network, of 100 minibatches of 64 x 256 steps
+    python -m benchmarks.speed.monitor_cost
+    python -m benchmarks.speed.monitor_cost --impala   # one NTK of the IMPALA network, of 100 minibatches of 64 x 256 steps
 """
 
 import argparse
@@ -22,14 +22,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 
-from benchmarks.speed import settings_of
+from benchmarks.speed.cases import model_settings
 from sb3_cchain import ChurnMonitor
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
 
 MONITORS: list[type[BaseCallback]] = [ChurnMonitor, NTKCallback, NetworkHealth]
 
-# Where monitors work: in the events of a callback, and in the hooks that they attach to optimisers
+# The methods in which monitors work: events of a callback, and hooks on optimisers
 ENTRANCES = ("_on_rollout_start", "_on_rollout_end", "_on_step", "_before_update", "_before_step")
 
 
@@ -65,7 +65,7 @@ def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: Base
 
 def impala() -> str:
     """
-    :return: What one NTK of the IMPALA network costs, in words. A rollout of images in ProcGen's shape, whatever is on them
+    :return: What one NTK of the IMPALA network costs, as a sentence. The rollout is of random images in ProcGen's shape
     """
     env = make_vec_env(FakeImageEnv, 64, seed=0, env_kwargs=dict(screen_height=64, screen_width=64, n_channels=3))
     settings = dict(policy=ImpalaPolicy, env=env, n_steps=256, batch_size=1024, n_epochs=1, seed=0, device="cpu")
@@ -83,11 +83,11 @@ def main() -> None:
     if args.impala:
         print(impala())
         return
-    minatar = settings_of("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
+    minatar = model_settings("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
     cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
     # Ten iterations of PPO; as many updates of DQN as are between two looks
     trainings: dict[str, tuple[type[BaseAlgorithm], dict[str, Any], int]] = {
-        "PPO, Gym Control": (PPO, settings_of("ppo", "Continual/Acrobot-v1"), 8000),
+        "PPO, Gym Control": (PPO, model_settings("ppo", "Continual/Acrobot-v1"), 8000),
         "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 20_480),
         "DQN, MinAtar": (DQN, minatar, 2400),
         "DQN, CartPole, SB3's defaults": (DQN, cart_pole, 8100),

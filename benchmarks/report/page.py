@@ -2,11 +2,13 @@
 
 import base64
 import re
+from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 
 from markdown_it import MarkdownIt
 
-# Colours are the reader's, dark or light; pictures keep the white ground that they are drawn on
+# Colours as the reader has set them, dark or light; pictures keep their white background
 STYLE = """
 :root { color-scheme: light dark; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
@@ -39,22 +41,24 @@ PAGE = """<!DOCTYPE html>
 """
 
 
-def html_page(markdown: str, folder: Path) -> str:
+def html_page(markdown: str, pictures: Mapping[str, Path]) -> str:
     """
-    :param markdown: Markdown, whose first line is its title, with tables, and with PNG pictures by their paths
-    :param folder: What these paths are relative to
+    :param markdown: Markdown, whose first line is its title, with tables and ``<ins>``; no other HTML passes
+    :param pictures: PNG files by the names that the Markdown has for them. No other file is embedded
     :return: The page. Headings have the anchors that GitHub gives them
     """
-    parser = MarkdownIt("commonmark", {"html": True}).enable("table")
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
     tokens = parser.parse(markdown)
     for token, following in zip(tokens, [*tokens[1:], None], strict=True):
         if token.type == "heading_open" and following is not None:
             token.attrSet("id", re.sub(r"[^\w\- ]", "", following.content.lower()).replace(" ", "-"))
         for child in token.children or ():
             if child.type == "image":
-                picture = base64.b64encode((folder / str(child.attrGet("src"))).read_bytes()).decode()
-                child.attrSet("src", f"data:image/png;base64,{picture}")
+                picture = pictures.get(str(child.attrGet("src")))
+                data = "" if picture is None else base64.b64encode(picture.read_bytes()).decode()
+                child.attrSet("src", f"data:image/png;base64,{data}")
     body = parser.renderer.render(tokens, parser.options, {})
     body = body.replace("<table>", '<div class="table"><table>').replace("</table>", "</table></div>")
-    title = markdown.splitlines()[0].lstrip("# ")
+    body = body.replace("&lt;ins&gt;", "<ins>").replace("&lt;/ins&gt;", "</ins>")
+    title = escape(markdown.splitlines()[0].lstrip("# "))
     return PAGE.format(title=title, style=STYLE, body=body)

@@ -1,51 +1,48 @@
-"""The report's tables, in Markdown."""
+"""The tables that set cells beside the paper's, in Markdown."""
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.cells import Cell, Cells
-from benchmarks.curves import LABELS
-from benchmarks.estimates import agrees, best_two
-from benchmarks.markdown import markdown_table
-from benchmarks.paper import AGGREGATE, Table
-from benchmarks.quantities import NTK
-from benchmarks.results import METHODS, Result
-from benchmarks.suites import SUITES
-
-MISSING = "–"
+from benchmarks.grid.results import Result
+from benchmarks.grid.run import short_name, suite_methods
+from benchmarks.report.cells import Cell, Cells
+from benchmarks.report.estimates import agrees, best_two
+from benchmarks.report.markdown import markdown_table
+from benchmarks.report.paper import AGGREGATE, Table
+from benchmarks.report.task_tables import MISSING, seeds_text
+from sb3_cchain.methods.registry import METHOD_NAMES
 
 
-def label_of(suite: str, method: str) -> str:
+def method_label(suite: str, method: str) -> str:
     """
     :param suite: Name of a suite
     :param method: Name of a method
-    :return: What it is called there
+    :return: The method's label in that suite
     """
-    return LABELS[SUITES[suite].methods[method]]
+    return suite_methods(suite)[method].label
 
 
-def methods_of(cells: Cells, paper: Table) -> list[str]:
+def table_methods(cells: Cells, paper: Table) -> list[str]:
     """
     :param cells: Cells of a suite
     :param paper: The paper's table
-    :return: The methods that are in either, in their order
+    :return: The methods that are in either, in the order of the tables
     """
-    return [method for method in METHODS if method in paper.methods or any(name == method for _, name in cells)]
+    return [method for method in METHOD_NAMES if method in paper.methods or any(name == method for _, name in cells)]
 
 
 def lengths_table(results: Sequence[Result], paper: Table) -> str:
     """
     :param results: Runs of a suite
     :param paper: The paper's table
-    :return: The budget's lengths beside the paper's, with a word on what that means
+    :return: The lengths of the runs beside the paper's, and what follows where they differ
     """
     lengths = {result.env_id: (result.n_tasks, result.steps_per_task) for result in results}
     rows = []
     for env_id in paper.lengths:
         if env_id in lengths:
-            rows.append([name_of(env_id), *(f"{n} × {steps:,}" for n, steps in (lengths[env_id], paper.lengths[env_id]))])
+            rows.append([short_name(env_id), *(f"{n} × {steps:,}" for n, steps in (lengths[env_id], paper.lengths[env_id]))])
     table = markdown_table(["tasks × environment steps", "here", "paper"], rows)
     seeds = f"The paper's means are of {paper.n_seeds} seeds."
     if all(paper.lengths[env_id] == length for env_id, length in lengths.items()):
@@ -63,16 +60,16 @@ def results_table(suite: str, cells: Cells, paper: Table) -> str:
     :param paper: The paper's table
     :return: For each environment, J(T) here, its interval, the paper's and the seeds; and the aggregates
     """
-    methods = methods_of(cells, paper)
-    digits = digits_of(paper)
+    methods = table_methods(cells, paper)
+    digits = table_digits(paper)
     rows = []
     for env_id in paper.lengths:
-        of_env = {method: cells[env_id, method] for method in methods if (env_id, method) in cells}
-        marks = best_two({method: cell.mean for method, cell in of_env.items()})
+        env_cells = {method: cells[env_id, method] for method in methods if (env_id, method) in cells}
+        marks = best_two({method: cell.mean for method, cell in env_cells.items()})
         paper_marks = best_two(paper.means(env_id))
-        here, interval, printed, seeds = [name_of(env_id), "here"], ["", "95 % interval"], ["", "paper"], ["", "seeds"]
+        here, interval, printed, seeds = [short_name(env_id), "here"], ["", "95 % interval"], ["", "paper"], ["", "seeds"]
         for method in methods:
-            cell, figure = of_env.get(method), paper.figures.get((env_id, method))
+            cell, figure = env_cells.get(method), paper.figures.get((env_id, method))
             here.append(MISSING)
             interval.append(MISSING)
             seeds.append(MISSING)
@@ -84,15 +81,15 @@ def results_table(suite: str, cells: Cells, paper: Table) -> str:
                         sign = " ✓" if agrees(cell.interval, figure.mean, figure.standard_error) else " ✗"
                 different = " †" if len(cell.versions) > 1 else ""
                 here[-1] = _marked(cell.mean, cell.error, digits, marks.get(method)) + sign + different
-                seeds[-1] = listed(cell.seeds)
+                seeds[-1] = seeds_text(cell.seeds)
             printed.append(_marked(figure.mean, figure.standard_error, digits, paper_marks.get(method)) if figure else MISSING)
-        rows += [here, interval, printed, seeds] if of_env else [here, printed]
+        rows += [here, interval, printed, seeds] if env_cells else [here, printed]
     if printed_sums := paper.means(AGGREGATE):
         rows += [
             ["aggregate", "here", *_sums(aggregates(cells, methods, paper), methods, digits)],
             ["", "paper", *_sums(printed_sums, methods, digits)],
         ]
-    return markdown_table(["J(T)", "", *(label_of(suite, method) for method in methods)], rows)
+    return markdown_table(["J(T)", "", *(method_label(suite, method) for method in methods)], rows)
 
 
 def aggregates(cells: Cells, methods: Sequence[str], paper: Table) -> dict[str, float]:
@@ -100,7 +97,7 @@ def aggregates(cells: Cells, methods: Sequence[str], paper: Table) -> dict[str, 
     :param cells: Cells of a suite
     :param methods: Methods
     :param paper: The paper's table
-    :return: The sum over all environments of the paper's table of the means, of those methods that have them all
+    :return: For the methods that have all environments of the paper's table, the sum of their means
     """
     complete = [method for method in methods if all((env_id, method) in cells for env_id in paper.lengths)]
     return {method: sum(cells[env_id, method].mean for env_id in paper.lengths) for method in complete}
@@ -110,12 +107,13 @@ def mark_differences(suite: str, paper: Table) -> list[str]:
     """
     :param suite: Name of the suite
     :param paper: The paper's table
-    :return: Where its marks are not those of its numbers, and its aggregates not the sums of its cells, by more than rounding
+    :return: Where its marks do not follow from its numbers, or its aggregates differ from the sums of its cells by more than
+        rounding
     """
     differences = []
     for (env_id, method), figure in paper.figures.items():
         means = paper.means(env_id)
-        name, label = "Aggregate" if env_id == AGGREGATE else name_of(env_id), label_of(suite, method)
+        name, label = "Aggregate" if env_id == AGGREGATE else short_name(env_id), method_label(suite, method)
         if best_two(means).get(method, "") != figure.mark:
             rank = 1 + sum(mean > figure.mean for other, mean in means.items() if other != "oracle")
             marked = f"marked as {figure.mark}" if figure.mark else "not marked"
@@ -129,8 +127,8 @@ def mark_differences(suite: str, paper: Table) -> list[str]:
 
 def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.ndarray], dict[str, list[int]]]:
     """
-    The part of a table that can be summed up over environments: those in which both Vanilla and C-CHAIN have runs, and the
-    methods and seeds that are in all of these.
+    The part of a table that can be aggregated over environments: the environments in which both Vanilla and C-CHAIN have runs,
+    and the methods and seeds that are in all of these.
 
     :param cells: Cells of a suite
     :param paper: The paper's table
@@ -138,9 +136,9 @@ def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.
     """
     env_ids = [env_id for env_id in paper.lengths if {(env_id, "vanilla"), (env_id, "cchain")} <= set(cells)]
     matrices, seeds_of = {}, {}
-    for method in METHODS:
-        of_method: list[Cell | None] = [cells.get((env_id, method)) for env_id in env_ids]
-        complete = [cell for cell in of_method if cell is not None]
+    for method in METHOD_NAMES:
+        method_cells: list[Cell | None] = [cells.get((env_id, method)) for env_id in env_ids]
+        complete = [cell for cell in method_cells if cell is not None]
         if not complete or len(complete) < len(env_ids):
             continue
         seeds = sorted(set.intersection(*(set(cell.seeds) for cell in complete)))
@@ -151,43 +149,10 @@ def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.
     return env_ids, matrices, seeds_of
 
 
-def ntk_table(results: Sequence[Result]) -> str:
-    """
-    :param results: Runs in one environment whose NTK was logged
-    :return: Of each quantity and method, its mean over the logs of each task and over the seeds
-    """
-    rows = []
-    for quantity in NTK:
-        for method in METHODS:
-            runs = [result for result in results if result.method == method]
-            per_seed = []
-            for result in runs:
-                in_tasks = [result.metric_of_task(quantity.name, task)[1] for task in range(result.n_tasks)]
-                per_seed.append([values.mean() if len(values) else math.nan for values in in_tasks])
-            if runs:
-                means = [MISSING if math.isnan(mean) else f"{mean:.3g}" for mean in np.mean(per_seed, axis=0)]
-                rows.append([quantity.label, LABELS[runs[0].algo], listed(sorted(run.seed for run in runs)), *means])
-    return markdown_table(["", "method", "seeds", *results[0].task_names], rows)
-
-
-def tasks_table(results: Sequence[Result], digits: int) -> str:
-    """
-    :param results: Runs in one environment
-    :param digits: Behind the point
-    :return: J(T_i) of each run and task, and J(T)
-    """
-    rows = []
-    for result in sorted(results, key=lambda result: (METHODS.index(result.method), result.seed)):
-        averages = result.task_averages()
-        cells = [MISSING if math.isnan(mean) else f"{mean:.{digits}f}" for mean in (*averages, float(np.mean(averages)))]
-        rows.append([LABELS[result.algo], str(result.seed), *cells])
-    return markdown_table(["method", "seed", *results[0].task_names, "J(T)"], rows)
-
-
-def digits_of(paper: Table) -> int:
+def table_digits(paper: Table) -> int:
     """
     :param paper: The paper's table
-    :return: How many figures behind the point returns of this size are told with
+    :return: Digits after the point for returns of this size
     """
     means = [figure.mean for (env_id, _), figure in paper.figures.items() if env_id != AGGREGATE]
     return 1 if max(map(abs, means)) >= 100 else 2
@@ -201,19 +166,3 @@ def _sums(sums: Mapping[str, float], methods: Sequence[str], digits: int) -> lis
 def _marked(mean: float, error: float | None, digits: int, mark: str | None) -> str:
     text = f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
     return {None: "{}", "best": "**{}**", "second": "<ins>{}</ins>"}[mark].format(text)
-
-
-def name_of(env_id: str) -> str:
-    """
-    :param env_id: Environment id
-    :return: For people
-    """
-    return env_id.removeprefix("Continual/")
-
-
-def listed(seeds: Sequence[int]) -> str:
-    """
-    :param seeds: Seeds
-    :return: As text
-    """
-    return " ".join(map(str, seeds))

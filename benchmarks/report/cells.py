@@ -1,12 +1,12 @@
-"""The cells of a table: runs of one method in one environment, that differ in their seed alone."""
+"""The cells of a table: runs of one method in one environment that differ in their seed alone."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from benchmarks.estimates import Interval, bootstrap_interval, mean_and_error
-from benchmarks.results import SETTINGS, Result
+from benchmarks.grid.results import Result
+from benchmarks.report.estimates import Interval, bootstrap_interval, mean_and_error
 
 Cells = dict[tuple[str, str], "Cell"]
 
@@ -35,58 +35,58 @@ class Cell:
 
     @property
     def error(self) -> float | None:
-        """Standard error of the mean, None of a single seed."""
+        """Standard error of the mean, None for a single seed."""
         return mean_and_error(self.scores)[1]
 
     @property
     def interval(self) -> Interval | None:
-        """95 % bootstrap interval of the mean, None of a single seed."""
+        """95 % bootstrap interval of the mean, None for a single seed."""
         return bootstrap_interval(self.scores)
 
     @property
     def versions(self) -> list[tuple[str, list[int]]]:
-        """Each set of versions among the runs, as far as they differ, and the seeds that have it."""
+        """Each set of versions among the runs (only the packages in which they differ), and the seeds that have it."""
         names = sorted({name for result in self.results for name in result.versions})
         differing = [name for name in names if len({result.versions.get(name) for result in self.results}) > 1]
         by_versions: dict[str, list[int]] = {}
         for result in self.results:
             versions = {name: result.versions.get(name, "unknown") for name in differing}
-            by_versions.setdefault(in_words(versions), []).append(result.seed)
+            by_versions.setdefault(versions_text(versions), []).append(result.seed)
         return list(by_versions.items())
 
 
-def cells_of(results: Iterable[Result]) -> tuple[Cells, list[str]]:
+def make_cells(results: Iterable[Result]) -> tuple[Cells, list[str]]:
     """
     :param results: Runs of one suite and budget
-    :return: Cells by environment id and method; and why runs are in none, in words: a cell with a run whose J(T) is not
-        defined is left out whole, as leaving that seed out would be a choice by its outcome
+    :return: Cells by environment id and method; and for each run whose J(T) is not defined the reason, in one line. Its cell
+        is left out as a whole: to leave out that seed alone would be a choice by its outcome
     :raises ValueError: When runs that should differ in their seed alone differ in other settings, or are there twice; or when
         lengths differ in an environment
     """
     by_cell: dict[tuple[str, str], list[Result]] = {}
     for result in sorted(results, key=lambda result: result.seed):
-        by_cell.setdefault((result.env_id, result.method), []).append(result)
+        by_cell.setdefault((result.env_id, result.line), []).append(result)
     lengths: dict[str, Result] = {}
     cells: Cells = {}
     left_out: list[str] = []
     for key, runs in by_cell.items():
-        _check_alike(runs, [name for name in SETTINGS if name != "seed"])
-        _check_alike([lengths.setdefault(key[0], runs[0]), *runs], ["n_tasks", "steps_per_task"])
+        _check_equal(runs, [name for name in runs[0].settings if name != "seed"])
+        _check_equal([lengths.setdefault(key[0], runs[0]), *runs], ["n_tasks", "steps_per_task"])
         for one, other in pairwise(runs):
             if one.seed == other.seed:
                 raise ValueError(f"Seed {one.seed} is there twice: {one.path} and {other.path}")
         averages = [result.task_averages() for result in runs]
-        scores = tuple(sum(of_run) / len(of_run) for of_run in averages)
+        scores = tuple(sum(run_averages) / len(run_averages) for run_averages in averages)
         if all(map(math.isfinite, scores)):
             cells[key] = Cell(tuple(runs), scores)
             continue
-        for result, of_run in zip(runs, averages, strict=True):
-            for task in (task for task, average in enumerate(of_run) if not math.isfinite(average)):
+        for result, run_averages in zip(runs, averages, strict=True):
+            for task in (task for task, average in enumerate(run_averages) if not math.isfinite(average)):
                 left_out.append(f"{key[0]}, {key[1]}, seed {result.seed}: no return in {result.task_names[task]}")
     return cells, left_out
 
 
-def in_words(versions: dict[str, str]) -> str:
+def versions_text(versions: dict[str, str]) -> str:
     """
     :param versions: Versions of packages
     :return: As text
@@ -94,10 +94,10 @@ def in_words(versions: dict[str, str]) -> str:
     return ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
 
 
-def _check_alike(runs: Sequence[Result], names: Sequence[str]) -> None:
+def _check_equal(runs: Sequence[Result], names: Sequence[str]) -> None:
     for result in runs[1:]:
         for name in names:
-            one, other = getattr(runs[0], name), getattr(result, name)
+            one, other = runs[0].settings[name], result.settings[name]
             if one != other:
                 paths = f"{runs[0].path} and {result.path}"
                 raise ValueError(f"Runs of one table must not differ in `{name}`: {paths} have {one} and {other}")

@@ -1,0 +1,109 @@
+"""The paper's grid: which runs there are in a suite under a budget, and how long a run will take."""
+
+from collections.abc import Iterable, Sequence
+
+from benchmarks.grid.results import Result
+from benchmarks.grid.run import Run, available_methods, make_run, paper_methods
+from benchmarks.grid.suites import SUITES, paper_length
+from sb3_cchain.methods.registry import METHOD_NAMES
+
+BUDGETS = ("paper", "reduced", "smoke")
+# Seeds of a budget; the paper's own stand in the suite's row
+N_SEEDS = {"reduced": 3, "smoke": 1}
+
+
+def run_length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
+    """
+    :param suite: Name of the suite
+    :param env_id: One of its environments
+    :param budget: One of ``BUDGETS``
+    :return: Number of tasks, and environment steps per task
+    """
+    n_tasks, steps = paper_length(env_id)
+    if budget == "smoke":
+        return 2, SUITES[suite].smoke_steps
+    return (n_tasks, steps) if budget == "paper" else SUITES[suite].reduce_length(n_tasks, steps)
+
+
+def grid_runs(
+    suites: Sequence[str],
+    env_ids: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    n_seeds: int | None = None,
+    budget: str = "paper",
+) -> list[Run]:
+    """
+    One seed of all cells is worth more than all seeds of some, so the seeds change last.
+
+    :param suites: Names of suites
+    :param env_ids: Environments, by default all of the suites
+    :param methods: Methods, in the order in which they are to run, by default all that the paper compares in the suite. A
+        method runs in those of the environments for which it has hyperparameters
+    :param n_seeds: Number of seeds, from 0; by default that of the budget
+    :param budget: One of ``BUDGETS``
+    :return: The runs, in the order in which they are to run
+    :raises ValueError: For an environment or a method that none of the suites has, less than one seed, or when nothing is left
+    """
+    all_envs = [(suite, env_id) for suite in suites for env_id in SUITES[suite].env_ids]
+    available = {name for suite, env_id in all_envs for name in available_methods(suite, env_id)}
+    _check_names("env", env_ids, [env_id for _, env_id in all_envs], suites)
+    _check_names("method", methods, [name for name in METHOD_NAMES if name in available], suites)
+    if n_seeds is not None and n_seeds < 1:
+        raise ValueError(f"--seeds must be at least 1; got {n_seeds}")
+    grid = []
+    for suite, env_id in all_envs:
+        if env_ids is not None and env_id not in env_ids:
+            continue
+        there = available_methods(suite, env_id)
+        chosen = [method for method in dict.fromkeys(methods or paper_methods(suite)) if method in there]
+        n_tasks, steps = run_length(suite, env_id, budget)
+        # At other budgets 30 evaluations in a task, as in the paper
+        eval_freq = steps if budget == "smoke" else None
+        for seed in range(n_seeds or N_SEEDS.get(budget, SUITES[suite].n_paper_seeds)):
+            for rank, method in enumerate(chosen):
+                run = make_run(suite, env_id, method, seed, n_tasks, steps, budget, eval_freq)
+                grid.append((seed, rank, run))
+    if not grid:
+        raise ValueError(
+            f"--method must be one with hyperparameters for {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
+        )
+    return [run for *_, run in sorted(grid, key=lambda entry: entry[:2])]
+
+
+def _check_names(option: str, given: Iterable[str] | None, allowed: Sequence[str], suites: Sequence[str]) -> None:
+    for name in given or ():
+        if name not in allowed:
+            raise ValueError(f"--{option} must be one of {', '.join(allowed)} in {', '.join(suites)}; got {name}")
+
+
+class Rates:
+    """
+    How long a run will take: from the results in its environment with its method, else in its suite with its method, else
+    from the suite's row. Smoke runs, which are mostly start-up, are used for other smoke runs only.
+
+    :param results: Results of any experiment
+    """
+
+    def __init__(self, results: Iterable[Result]):
+        self._totals: dict[tuple, tuple[int, float]] = {}
+        for result in results:
+            for key in self._keys(result):
+                steps, seconds = self._totals.get(key, (0, 0.0))
+                self._totals[key] = (steps + result.total_steps, seconds + result.seconds)
+
+    @staticmethod
+    def _keys(run: Run) -> tuple[tuple, tuple]:
+        kind = run.experiment == "smoke", run.line
+        return (*kind, run.env_id), (*kind, run.suite)
+
+    def seconds(self, run: Run) -> float:
+        """
+        :param run: A run
+        :return: Seconds that it will take on one core
+        """
+        for key in self._keys(run):
+            if key in self._totals:
+                steps, seconds = self._totals[key]
+                return run.total_steps * seconds / steps
+        rates = SUITES[run.suite].rates
+        return run.total_steps / rates.get(run.method, rates["vanilla"])

@@ -1,0 +1,143 @@
+"""The nodes of a Ray cluster."""
+
+import os
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.grid.executor import checkout_commit
+from benchmarks.grid.run import ROOT, Run
+from benchmarks.grid.training import PROGRAM, Finished, Training, TrainingFailed
+from benchmarks.grid.view import Failure
+
+# Parts of the checkout that no run needs
+NOT_SENT = [".git", "docs", "tests", "benchmarks/results"]
+
+
+def import_ray() -> Any:
+    """
+    :return: The module
+    :raises ImportError: When it is not installed
+    """
+    # Sends no report of this use to Ray's authors
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError(f'--address needs Ray ({error}): pip install -e ".[cluster]"') from error
+    return ray
+
+
+class RayBackend:
+    """
+    Joins a Ray cluster. Its nodes get this checkout and run in a copy of it, so all runs have the same code, and a node's own
+    installation matters for the dependencies alone.
+
+    Ray itself retries nothing: its retries are not shown, and are without end when memory ran out.
+
+    :param address: Address of the cluster
+    :param gpus_per_run: GPUs of a run; runs that have one train on it
+    :param program: The training command before its arguments
+    :raises ImportError: When Ray is not installed
+    :raises ConnectionError: When nothing answers at the address
+    :raises ValueError: When there are fewer GPUs than a run needs
+    """
+
+    def __init__(self, address: str, gpus_per_run: float = 0.0, program: Sequence[str] = PROGRAM):
+        self._ray = ray = import_ray()
+        self._gpus_per_run, self.program = gpus_per_run, program
+        self._git_commit = checkout_commit()
+        self._running: dict[Any, Run] = {}
+        self._logs = Path()
+        if ":" in address:
+            # Ray itself would go on trying for minutes
+            host, port = address.removeprefix("ray://").rsplit(":", 1)
+            try:
+                socket.create_connection((host, int(port)), timeout=10).close()
+            except (OSError, ValueError) as error:
+                raise ConnectionError(f"--address must be that of a Ray cluster; got {address}: {error}") from error
+        runtime_env = {"working_dir": str(ROOT), "excludes": NOT_SENT}
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", runtime_env=runtime_env)
+        gpus = ray.cluster_resources().get("GPU", 0)
+        if gpus < gpus_per_run:
+            ray.shutdown()
+            raise ValueError(f"--gpus-per-run must be at most the GPUs that Ray finds, {gpus:g}; got {gpus_per_run}")
+        options = dict(num_cpus=1, num_gpus=gpus_per_run, max_retries=0, scheduling_strategy="SPREAD")
+        self._task = ray.remote(_train).options(**options)
+
+    def __enter__(self) -> "RayBackend":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ray.shutdown()
+
+    def slots(self) -> int:
+        """
+        :return: How many runs the cluster can execute at a time now
+        """
+        return count_slots(self._ray.cluster_resources(), self._gpus_per_run)
+
+    def start(self, run: Run, logs: Path) -> None:
+        """
+        :param run: Run to start
+        :param logs: Folder of all logs, on the machine that the run is on
+        """
+        self._logs = logs.absolute()
+        device = "cuda" if self._gpus_per_run > 0 else "cpu"
+        self._running[self._task.remote(run, self._logs, device, self._git_commit, self.program)] = run
+
+    def wait(self, seconds: float) -> list[tuple[Run, Finished | Failure]]:
+        """
+        :param seconds: How long to wait at most, roughly
+        :return: Runs that have ended, and how
+        """
+        if not self._running:
+            return []
+        ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=seconds)
+        ended: list[tuple[Run, Finished | Failure]] = []
+        for reference in ready:
+            run = self._running.pop(reference)
+            try:
+                ended.append((run, Finished(*self._ray.get(reference))))
+            except self._ray.exceptions.RayError as error:
+                ended.append((run, _failure(run, error, self._logs)))
+        return ended
+
+    def progress(self) -> dict[Run, str]:
+        """
+        :return: Nothing: the logs are on the nodes
+        """
+        return {}
+
+
+def _train(run: Run, logs: Path, device: str, git_commit: str | None, program: Sequence[str]) -> Finished:
+    """On a node: train to the end."""
+    training = Training(run, logs, device, git_commit, program)
+    try:
+        while training.is_running():
+            time.sleep(0.2)
+    finally:
+        training.kill()
+    return training.finish()
+
+
+def count_slots(resources: dict[str, float], gpus_per_run: float) -> int:
+    """
+    :param resources: Resources of the cluster, as Ray counts them
+    :param gpus_per_run: GPUs of a run
+    :return: How many runs, of one core each, it can execute at a time; at least one
+    """
+    n_runs = int(resources.get("CPU", 0))
+    if gpus_per_run > 0:
+        n_runs = min(n_runs, int(resources.get("GPU", 0) / gpus_per_run + 1e-9))
+    return max(n_runs, 1)
+
+
+def _failure(run: Run, error: Exception, logs: Path) -> Failure:
+    """The failure that a Ray error stands for."""
+    cause = getattr(error, "cause", None) or error
+    if isinstance(cause, TrainingFailed):
+        return Failure(run, *cause.args)
+    return Failure(run, f"{type(cause).__name__}: {' '.join(str(cause).split())}"[:200], str(run.path_in(logs)))

@@ -1,0 +1,219 @@
+"""What a training run is: the command that a user would type, and the settings by which a finished run counts as this one."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.grid.suites import SUITES, paper_length
+from sb3_cchain.methods.registry import METHOD_NAMES, REGISTRY, Method, find_method
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One training run under the shipped hyperparameters.
+
+    :param suite: Name of the suite
+    :param env_id: One of its environments
+    :param method: Name of a method (``sb3_cchain/methods/registry.py``)
+    :param seed: Seed of the agent, and of the offsets in Gym Control
+    :param n_tasks: Length of the task sequence
+    :param steps_per_task: Environment steps per task
+    :param experiment: What the run is part of: a budget of the grid, or the name of a comparison. Names the folder
+    :param eval_freq: Environment steps between two evaluations (ten greedy episodes of the task being trained), or -1
+    :param variant: Name of the method's variant, None for the method itself
+    :param overrides: What differs from the shipped hyperparameters, as after ``--hyperparams`` on the command line
+    """
+
+    suite: str
+    env_id: str
+    method: str
+    seed: int
+    n_tasks: int
+    steps_per_task: int
+    experiment: str
+    eval_freq: int = -1
+    variant: str | None = None
+    overrides: tuple[str, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """Name of the method or its variant: runs of one line in a figure or row of a table differ in their seed alone."""
+        return self.variant or self.method
+
+    @property
+    def name(self) -> str:
+        """Human-readable name."""
+        return f"{short_name(self.env_id)} {self.line} seed {self.seed}"
+
+    @property
+    def algo(self) -> str:
+        """The method's name on the command line."""
+        return find_method(self.method, self.suite).algo
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of the whole run."""
+        return self.n_tasks * self.steps_per_task
+
+    @property
+    def task_boundaries(self) -> list[int]:
+        """Environment steps at which each task ends."""
+        return [self.steps_per_task * (task + 1) for task in range(self.n_tasks)]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """
+        What determines the run: a finished run with equal settings is this run, done. The versions of the packages are not
+        part of them: they are recorded.
+        """
+        return self._settings(as_json(shipped_hyperparameters(self.algo, self.env_id)))
+
+    def _settings(self, hyperparameters: Mapping[str, Any] | None) -> dict[str, Any]:
+        return {
+            "env_id": self.env_id,
+            "method": self.method,
+            "seed": self.seed,
+            "n_tasks": self.n_tasks,
+            "steps_per_task": self.steps_per_task,
+            "eval_freq": self.eval_freq,
+            "overrides": list(self.overrides),
+            "hyperparameters": hyperparameters,
+        }
+
+    def path_in(self, folder: Path) -> Path:
+        """
+        :param folder: Folder of all results, or of all logs
+        :return: The run's own folder in it
+        """
+        env = self.env_id.replace("/", "-")
+        return folder / self.experiment / self.suite / env / self.line / f"seed_{self.seed}"
+
+    def arguments(self, folder: Path, device: str = "cpu") -> list[str]:
+        """
+        :param folder: Where RL Zoo's files go
+        :param device: PyTorch device
+        :return: The command after ``sb3-cchain``
+        """
+        env_kwargs = {"steps_per_task": self.steps_per_task, **SUITES[self.suite].env_kwargs(self.n_tasks, self.seed)}
+        return [
+            *("train", "--algo", self.algo, "--env", self.env_id, "--seed", str(self.seed)),
+            *("--n-timesteps", str(self.total_steps), "--num-threads", "1", "--device", device),
+            *("--eval-freq", str(self.eval_freq), "--eval-episodes", "10"),
+            *("--log-folder", str(folder), "--tensorboard-log", str(folder / "tensorboard"), "--verbose", "0"),
+            *("--env-kwargs", *(f"{name}:{value}" for name, value in env_kwargs.items())),
+            *(("--hyperparams", *self.overrides) if self.overrides else ()),
+        ]
+
+
+def make_run(
+    suite: str,
+    env_id: str,
+    method: str,
+    seed: int,
+    n_tasks: int,
+    steps_per_task: int,
+    experiment: str,
+    eval_freq: int | None = None,
+) -> Run:
+    """
+    :param suite: Name of the suite
+    :param env_id: One of its environments
+    :param method: Name of a method
+    :param seed: Seed
+    :param n_tasks: Length of the task sequence
+    :param steps_per_task: Environment steps per task
+    :param experiment: What the run is part of
+    :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the paper
+    :return: The run
+    :raises ValueError: When the method has no settings for the environment, for more tasks than the environment has, for no
+        evaluation in a task, or for a negative seed
+    """
+    for argument, value, least in (("seed", seed, 0), ("n_tasks", n_tasks, 1), ("steps_per_task", steps_per_task, 1)):
+        if value < least:
+            raise ValueError(f"`{argument}` must be at least {least}; got {value}")
+    if env_id not in SUITES[suite].env_ids:
+        raise ValueError(f"`env_id` must be one of {', '.join(SUITES[suite].env_ids)}; got {env_id}")
+    if method not in (allowed := available_methods(suite, env_id)):
+        raise ValueError(f"`method` must be one of {', '.join(allowed)} in {env_id}; got {method}")
+    if "n_tasks" not in SUITES[suite].env_kwargs(n_tasks, seed) and n_tasks > paper_length(env_id)[0]:
+        raise ValueError(f"`n_tasks` must be at most {paper_length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
+    if not SUITES[suite].evaluates:
+        return Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
+    if not 0 < (steps_per_task // 30 if eval_freq is None else eval_freq) <= steps_per_task:
+        raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
+    return Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment, eval_freq or steps_per_task // 30)
+
+
+def paper_methods(suite: str) -> list[str]:
+    """
+    :param suite: Name of a suite
+    :return: The methods that the paper compares in it, in the order of the tables
+    """
+    return [method.name for method in REGISTRY if suite in method.suites]
+
+
+def suite_methods(suite: str) -> dict[str, Method]:
+    """
+    :param suite: Name of a suite
+    :return: By name, in the order of the tables, all methods that there are for the suite's algorithm
+    """
+    methods = {}
+    for name in METHOD_NAMES:
+        try:
+            methods[name] = find_method(name, suite)
+        except ValueError:
+            pass  # of another algorithm
+    return methods
+
+
+def available_methods(suite: str, env_id: str) -> list[str]:
+    """
+    :param suite: Name of a suite
+    :param env_id: One of its environments
+    :return: The methods that have shipped hyperparameters for the environment, in the order of the tables
+    """
+    return [name for name, method in suite_methods(suite).items() if shipped_hyperparameters(method.algo, env_id)]
+
+
+def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
+    """
+    :param algo: Name of the algorithm on the command line
+    :param env_id: Environment id
+    :return: What our YAML file says about the environment, None where it says nothing
+    """
+    return _read_yaml(ROOT / "zoo_hyperparams" / f"{algo}.yml").get(env_id)
+
+
+@cache
+def _read_yaml(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text()) if path.exists() else {}
+
+
+def as_json(value: Any) -> Any:
+    """
+    :param value: A value read from YAML
+    :return: The same as JSON holds it, which has no infinity
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): as_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_json(entry) for entry in value]
+    return value
+
+
+def short_name(env_id: str) -> str:
+    """
+    :param env_id: Environment id
+    :return: The id without its namespace
+    """
+    return env_id.removeprefix("Continual/")

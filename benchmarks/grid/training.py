@@ -1,0 +1,196 @@
+"""One attempt at a run: a training process, and what is read from its logs."""
+
+import os
+import platform
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.grid.results import METRIC_PREFIXES, Result
+from benchmarks.grid.run import Run, as_json, shipped_hyperparameters
+from benchmarks.grid.suites import SUITES, task_names
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
+
+# Packages whose versions are recorded
+PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
+# The command `sb3-cchain`, whether or not it is on the path
+PROGRAM = (sys.executable, "-m", "sb3_cchain.zoo.cli")
+
+
+class TrainingFailed(RuntimeError):
+    """
+    A training process ended with an error.
+
+    :param reason: In one line
+    :param log: Path of its log
+    :param node: Name of the machine
+    """
+
+    def __init__(self, reason: str, log: str, node: str):
+        super().__init__(reason, log, node)
+
+
+class Finished(NamedTuple):
+    """What is kept of a run: the arguments of :func:`benchmarks.grid.results.write_result`."""
+
+    result: Result
+    returns: list[dict[str, Any]]
+    metrics: list[dict[str, Any]]
+
+
+class Training:
+    """
+    Starts a run in a process of its own, with one thread.
+
+    Each attempt has a folder of its own, so two attempts never write to the same one, whatever is left of the first: Ray
+    starts a task again when it has lost sight of a machine, which may still be alive. On Linux a process whose parent died
+    dies too (``child.py``); that frees its core for the next attempt, but correctness does not depend on it.
+
+    :param run: The run
+    :param logs: Folder of all logs
+    :param device: PyTorch device
+    :param git_commit: Commit to record
+    :param program: The command before its arguments
+    :param environment: Environment variables to add
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        logs: Path,
+        device: str = "cpu",
+        git_commit: str | None = None,
+        program: Sequence[str] = PROGRAM,
+        environment: dict[str, str] | None = None,
+    ):
+        self.run = run
+        self._device, self._git_commit = device, git_commit
+        self._started = datetime.now(timezone.utc)
+        self._clock = time.monotonic()
+        self._memory: int | None = None
+        self.folder = run.path_in(logs) / f"attempt_{self._started:%Y%m%dT%H%M%S}_{uuid.uuid4().hex[:8]}"
+        self.folder.mkdir(parents=True)
+        self.log = self.folder / "log.txt"
+        arguments = run.arguments(self.folder, device)
+        with open(self.log, "w") as log:
+            log.write(f"sb3-cchain {shlex.join(arguments)}\n")
+            log.flush()
+            # As many threads as --num-threads, for the libraries that read the environment too
+            variables = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}
+            child = [sys.executable, str(Path(__file__).with_name("child.py")), str(os.getpid())]
+            self._process = subprocess.Popen(
+                [*child, *program, *arguments], stdout=log, stderr=subprocess.STDOUT, env=variables
+            )
+
+    def is_running(self) -> bool:
+        """
+        :return: Whether the process is running. To be asked often: it also takes note of the memory
+        """
+        self._memory = _peak_memory(self._process.pid) or self._memory
+        return self._process.poll() is None
+
+    def progress(self) -> str:
+        """
+        :return: How far training is, in a few words; empty before the first return
+        """
+        try:
+            last = self._training_returns()[-1]
+        except (IndexError, ValueError, TypeError, OSError):
+            return ""  # nothing there yet, or the line is being written
+        return f"{last['timesteps'] / self.run.total_steps:.0%}, task {last['task_id']}, return {last['mean_return']:.0f}"
+
+    def kill(self) -> None:
+        """End the process, if it has not ended yet."""
+        self._process.kill()
+        self._process.wait()
+
+    def finish(self) -> Finished:
+        """
+        :return: The result of a process that has ended, not written yet, and its rows
+        :raises TrainingFailed: When the process failed
+        """
+        run, seconds = self.run, time.monotonic() - self._clock
+        if self._process.returncode != 0:
+            reason = _failure_reason(self.log, self._process.returncode)
+            raise TrainingFailed(reason, str(self.log), platform.node())
+        # In the command the folder that a user would choose, not the attempt's
+        command = ["sb3-cchain", *run.arguments(run.path_in(Path("logs/grid")), self._device)]
+        result = Result(
+            **vars(run),
+            path=Path(),
+            task_names=list(task_names(run.suite, run.env_id, run.n_tasks)),
+            hyperparameters=as_json(shipped_hyperparameters(run.algo, run.env_id)),
+            command=command,
+            versions={**{name: version(name) for name in (*PACKAGES, "numpy")}, "python": platform.python_version()},
+            git_commit=self._git_commit,
+            started=self._started.isoformat(timespec="seconds"),
+            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            seconds=round(seconds, 1),
+            peak_memory=self._memory,
+        )
+        returns = self._evaluations() if SUITES[run.suite].evaluates else self._training_returns()
+        return Finished(result, returns, self._metrics())
+
+    def _training_returns(self) -> list[dict[str, float]]:
+        """Rows of ``returns.csv`` so far."""
+        files = list(self.folder.glob(f"tensorboard/*/*/{RETURNS_CSV}"))
+        return read_returns(files[0]) if files else []
+
+    def _evaluations(self) -> list[dict[str, float]]:
+        """A row like those of ``returns.csv`` for each evaluation."""
+        files = list(self.folder.glob("*/*/evaluations.npz"))
+        if not files:
+            return []
+        logged = np.load(files[0])
+        return [
+            # The step that ends a task is still part of it
+            {
+                "timesteps": int(steps),
+                "task_id": (int(steps) - 1) // self.run.steps_per_task,
+                "n_episodes": len(returns),
+                "mean_return": float(np.mean(returns)),
+            }
+            for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
+        ]
+
+    def _metrics(self) -> list[dict[str, Any]]:
+        """Rows of ``metrics.csv``: what was logged to TensorBoard, to six digits."""
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        rows = []
+        for folder in sorted({file.parent for file in self.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
+            logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
+            logged.Reload()
+            for name in logged.Tags()["scalars"]:
+                if name.startswith(METRIC_PREFIXES):
+                    values = logged.Scalars(name)
+                    rows += [{"timesteps": event.step, "name": name, "value": f"{event.value:.6g}"} for event in values]
+        return rows
+
+
+def _peak_memory(pid: int) -> int | None:
+    """Bytes that a running process has had resident at most, where Linux tells."""
+    try:
+        found = re.search(r"VmHWM:\s*(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    except OSError:
+        return None
+    return 1024 * int(found[1]) if found else None
+
+
+def _failure_reason(log: Path, returncode: int) -> str:
+    """Why a process ended, in one line: the signal, or the last line of its log."""
+    if returncode < 0:
+        return f"killed by {signal.Signals(-returncode).name}"
+    return [line for line in log.read_text(errors="replace").splitlines() if line.strip()][-1].strip()[:200]

@@ -1,0 +1,208 @@
+"""All pictures: for each method or variant the mean over its seeds, with a band of its standard error."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from benchmarks.grid.results import Result, Series
+from benchmarks.grid.suites import SUITES
+from benchmarks.report.quantities import RETURNS, Quantity
+from benchmarks.report.random_policy import TaskLook
+from sb3_cchain.methods.registry import Method
+
+N_POINTS = 100
+SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
+
+
+def smoothed(values: np.ndarray, window: int) -> np.ndarray:
+    """
+    :param values: A series
+    :param window: Length of the running mean
+    :return: Mean of the last ``window`` values at each point, of fewer at the beginning
+    """
+    sums = np.cumsum(np.insert(values, 0, 0.0))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """
+    :param curves: Environment steps and values of each seed
+    :param logarithmic: Whether mean and standard error are those of the logarithms, which no single seed dominates
+    :return: Where all seeds have values, by interpolation: environment steps, mean, mean - standard error, mean + standard
+        error (the mean itself for a single seed)
+    """
+    start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    grid = np.linspace(start, end, N_POINTS if start < end else 1)
+    transform: Callable[[np.ndarray], np.ndarray] = np.asarray
+    inverse = transform
+    if logarithmic:
+        smallest = np.finfo(float).tiny  # in place of 0 and of what rounding made negative
+        transform, inverse = lambda values: np.log(np.maximum(values, smallest)), np.exp
+    seeds = np.array([np.interp(grid, steps, transform(values)) for steps, values in curves])
+    mean = seeds.mean(axis=0)
+    error = seeds.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros_like(mean)
+    return grid, inverse(mean), inverse(mean - error), inverse(mean + error)
+
+
+def plot_learning_curves(
+    results: Sequence[Result],
+    path: Path,
+    lines: Mapping[str, Method],
+    title: str | None = None,
+    looks: Sequence[TaskLook] = (),
+) -> None:
+    """
+    Returns against environment steps. In a suite whose tasks differ in the size of their returns each task has a panel of its
+    own.
+
+    :param results: All runs in one environment, of one length
+    :param path: PNG file
+    :param lines: Label and colour of each method or variant, in their order
+    :param title: Title
+    :param looks: What each task looks like without an agent: its frame is drawn above the curves, the return of the random
+        policy as a dotted line
+    """
+    suite, n_tasks, ends = SUITES[results[0].suite], results[0].n_tasks, results[0].task_boundaries
+    frames = [look.frame for look in looks if look.frame is not None]
+    frames_height = min(8 / n_tasks * max((frame.shape[0] / frame.shape[1] for frame in frames), default=0), 2.4)
+    figure = _new_figure(9, 4 + frames_height)
+    grid = figure.add_gridspec(2 if frames else 1, n_tasks, height_ratios=[frames_height, 3.8] if frames else [1])
+    for task, frame in enumerate(frames):
+        picture = figure.add_subplot(grid[0, task])
+        picture.imshow(frame)
+        picture.axis("off")
+    if suite.own_scales:
+        panels = [figure.add_subplot(grid[-1, task]) for task in range(n_tasks)]
+    else:
+        panels = [figure.add_subplot(grid[-1, :])] * n_tasks
+    _draw(panels, results, lines, RETURNS, suite.smoothing)
+    for task, look in enumerate(looks):
+        start = ends[task - 1] if task else 0
+        panels[task].hlines(look.random_return, start, ends[task], color="0.35", linestyle=":", label="random policy")
+    for task, name in enumerate(results[0].task_names) if suite.own_scales or looks else ():
+        middle = ends[task] - results[0].steps_per_task / 2
+        above: dict[str, Any] = dict(ha="center", va="bottom", transform=panels[task].get_xaxis_transform())
+        panels[task].text(middle, 1.01, name, parse_math=False, **above)
+    panels[0].set_ylabel(RETURNS.label)
+    if title:
+        figure.suptitle(title, parse_math=False)
+    _save(figure, panels, path)
+
+
+def plot_quantities(
+    results: Sequence[Result],
+    path: Path,
+    lines: Mapping[str, Method],
+    quantities: Sequence[Quantity],
+    title: str | None = None,
+    window: int = 1,
+) -> None:
+    """
+    Several quantities against environment steps, a panel each.
+
+    :param results: Runs in one environment, of one length
+    :param path: PNG file
+    :param lines: Label and colour of each method or variant, in their order
+    :param quantities: What is drawn
+    :param title: Title
+    :param window: Logged values that the running mean goes over, inside a task
+    """
+    n_rows = math.ceil(len(quantities) / 3)
+    figure = _new_figure(12, 3.4 * n_rows)
+    panels = list(figure.subplots(n_rows, 3, squeeze=False).flat)
+    for panel in panels[len(quantities) :]:
+        panel.axis("off")
+    panels = panels[: len(quantities)]
+    for panel, quantity in zip(panels, quantities, strict=True):
+        _draw([panel] * results[0].n_tasks, results, lines, quantity, window)
+        panel.set_title(quantity.label, fontsize="medium")
+        greatest = max((np.max(line.get_ydata()) for line in panel.get_lines() if line.get_label()[0] != "_"), default=0)
+        if quantity.logarithmic and greatest > 0:
+            panel.set_yscale("log")
+            # What a policy that repeats one action is left with would take most of the scale
+            panel.set_ylim(bottom=max(1e-4 * greatest, panel.get_ylim()[0]))
+    if title:
+        figure.suptitle(title)
+    _save(figure, panels, path)
+
+
+def plot_reliable_metrics(
+    estimates: Mapping[str, np.ndarray],
+    intervals: Mapping[str, np.ndarray],
+    metric_names: Sequence[str],
+    lines: Mapping[str, Method],
+    path: Path,
+) -> None:
+    """
+    :param estimates: Of each method, the metrics
+    :param intervals: Of each method, the ends of their intervals
+    :param metric_names: Names of the metrics
+    :param lines: Label and colour of each method
+    :param path: PNG file
+    """
+    from rliable.plot_utils import plot_interval_estimates  # only the report needs it
+
+    plt.style.use("default")
+    height = max(1.6, 0.45 * len(estimates))  # inches
+    upwards = list(estimates)[::-1]
+    figure, _ = plot_interval_estimates(
+        {lines[method].label: estimates[method] for method in upwards},
+        {lines[method].label: intervals[method] for method in upwards},
+        list(metric_names),
+        colors={lines[method].label: lines[method].color for method in upwards},
+        row_height=height / len(estimates),
+        xlabel_y_coordinate=-0.5 / height,
+        xlabel="normalised score",
+        max_ticks=3,
+    )
+    figure.savefig(path, dpi=90, bbox_inches="tight")
+    plt.close(figure)
+
+
+def _new_figure(width: float, height: float) -> Any:
+    plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
+    return plt.figure(figsize=(width, height), layout="constrained")
+
+
+def _draw(
+    panels: Sequence[Any], results: Sequence[Result], lines: Mapping[str, Method], quantity: Quantity, window: int
+) -> None:
+    """Each task in its panel: a line and a band for each method that has values there, and the switches."""
+    boundaries = results[0].task_boundaries
+    for task, panel in enumerate(panels):
+        for name, line in lines.items():
+            curves = [quantity.series(result, task) for result in results if result.line == name]
+            curves = [(steps, smoothed(values, window)) for steps, values in curves if len(steps)]
+            if not curves:
+                continue
+            grid, mean, low, high = band(curves, quantity.logarithmic)
+            marker = "o" if len(grid) == 1 else None
+            panel.plot(grid, mean, color=line.color, linewidth=1.8, marker=marker, label=line.label)
+            panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
+        if task > 0 and panel is panels[task - 1]:
+            panel.axvline(boundaries[task - 1], **SWITCH_STYLE)
+        panel.set_xlim(boundaries[task - 1] if task and panel is not panels[0] else 0, boundaries[task])
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+        panel.spines[["top", "right"]].set_visible(False)
+
+
+def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
+    """With one legend for all panels."""
+    panels[len(panels) // 2].set_xlabel("environment steps")
+    legend = {}
+    for panel in panels:
+        legend.update({label: handle for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)})
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 5), frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""What churn reduction, the related methods and the monitors cost."""
