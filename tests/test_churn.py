@@ -320,7 +320,7 @@ def test_a_loss_beyond_the_precision_raises_before_the_gradient(coef, change):
     reducer.backward(th.ones(4, 3))
     reducer.old_outputs += change
     with pytest.raises(
-        ValueError, match="λ times the churn loss, .* is beyond the network's precision.*not been made.*rewards"
+        ValueError, match=r"λ times the churn loss, .* is beyond the network's precision.*not been made.*rewards"
     ):
         reducer.backward(th.ones(4, 3))
     assert all(parameter.grad is None for parameter in network.parameters())
