@@ -1,13 +1,20 @@
 """The report: its statistics by hand, and whole reports of small made-up results."""
 
+import json
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.cells import cells_of
-from benchmarks.estimates import (
+from benchmarks.grid.results import Result, read_results, write_result
+from benchmarks.grid.run import ROOT, Run, as_json, paper_methods, shipped_hyperparameters, suite_methods
+from benchmarks.grid.suites import SUITES, paper_length
+from benchmarks.report.__main__ import main
+from benchmarks.report.cells import make_cells
+from benchmarks.report.document import write_report
+from benchmarks.report.estimates import (
     agrees,
     best_two,
     bootstrap_interval,
@@ -16,14 +23,14 @@ from benchmarks.estimates import (
     probability_of_improvement,
     reliable_metrics,
 )
-from benchmarks.figures import band, plot_learning_curves
-from benchmarks.page import html_page
-from benchmarks.paper import read_tables
-from benchmarks.report import main, write_report
-from benchmarks.results import METHODS, Result, in_json, read_results, result_path, write_result
-from benchmarks.runs import shipped_hyperparameters
-from benchmarks.suites import ALL_ENVS, SUITES
-from benchmarks.tables import aggregates, mark_differences, ntk_table, results_table, score_matrices, tasks_table
+from benchmarks.report.figures import band, plot_learning_curves, plot_quantities, smoothed
+from benchmarks.report.markdown import code, escaped
+from benchmarks.report.page import html_page
+from benchmarks.report.paper import read_tables
+from benchmarks.report.quantities import NTK, PLASTICITY, RETURNS, Quantity
+from benchmarks.report.random_policy import TaskLook
+from benchmarks.report.tables import aggregates, mark_differences, results_table, score_matrices
+from benchmarks.report.task_tables import average_cells, cost_table, mean_rows, quantities_table, returns_header, returns_rows
 
 ACROBOT, CARTPOLE = "Continual/Acrobot-v1", "Continual/CartPole-v1"
 VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
@@ -31,47 +38,58 @@ VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
 
 @pytest.fixture(autouse=True)
 def few_resamples(monkeypatch):
-    monkeypatch.setattr("benchmarks.estimates.N_RESAMPLES", 100)
+    monkeypatch.setattr("benchmarks.report.estimates.N_RESAMPLES", 100)
+
+
+@pytest.fixture
+def no_drawing(monkeypatch):
+    """For tests of the text alone."""
+    for name in ("plot_learning_curves", "plot_quantities", "plot_reliable_metrics"):
+        monkeypatch.setattr(
+            f"benchmarks.report.document.{name}",
+            lambda *arguments: [path.write_bytes(b"png") for path in arguments if isinstance(path, Path)],
+        )
+
+
+GYM_LINES = suite_methods("gym_control")
 
 
 def write(folder, method, returns, env_id=ACROBOT, seed=0, metrics=(), suite="gym_control", **fields):
     """A run of two tasks of 100 steps, with one rollout for each of the returns of a task."""
-    of_tasks = dict(enumerate(returns))
+    run = Run(suite, env_id, method, seed, 2, 100, "smoke", variant=fields.get("variant"))
     result = Result(
         **{
-            "path": result_path(folder, "smoke", suite, env_id, method, seed),
-            "suite": suite,
-            "env_id": env_id,
-            "method": method,
-            "algo": SUITES[suite].methods[method],
-            "seed": seed,
-            "budget": "smoke",
-            "n_tasks": 2,
-            "steps_per_task": 100,
+            **vars(run),
+            "path": run.path_in(folder),
             "task_names": ["task 0", "task 1"],
-            "task_boundaries": [100, 200],
-            "hyperparameters": in_json(shipped_hyperparameters(SUITES[suite].methods[method], env_id)),
+            "hyperparameters": as_json(shipped_hyperparameters(run.algo, env_id)),
             "command": ["sb3-cchain", "train"],
             "versions": VERSIONS,
             "git_commit": None,
             "started": "2026-01-01T00:00:00+00:00",
             "finished": "2026-01-01T01:00:00+00:00",
             "seconds": 3600.0,
-            "steps_per_second": 1.0,
             "peak_memory": None,
             **fields,
         }
     )
     rows = [
         {"timesteps": 100 * task + 10 * (i + 1), "task_id": task, "n_episodes": 1, "mean_return": value}
-        for task, values in of_tasks.items()
+        for task, values in enumerate(returns)
         for i, value in enumerate(values)
     ]
     write_result(result, rows, [dict(zip(("timesteps", "name", "value"), row, strict=True)) for row in metrics])
+    return result.path
+
+
+def whole_results(folder):
+    results, left_out = read_results(folder)
+    assert left_out == {}
+    return results
 
 
 def cells_in(folder):
-    return cells_of(read_results(folder))[0]
+    return make_cells(whole_results(folder))[0]
 
 
 def table_rows(table):
@@ -163,17 +181,21 @@ def test_the_papers_tables_are_whole():
     assert {suite: len(table.figures) for suite, table in tables.items()} == dict(
         gym_control=4 * 6 + 6, procgen=16 * 9 + 9, dmc=9, minatar=2
     )
-    assert {env_id for table in tables.values() for env_id in table.lengths} == set(ALL_ENVS)
-    assert {suite: table.n_seeds for suite, table in tables.items()} == dict(gym_control=6, procgen=6, dmc=12, minatar=12)
+    assert {env_id for table in tables.values() for env_id in table.lengths} == {
+        env_id for suite in SUITES.values() for env_id in suite.env_ids
+    }
+    assert {suite: table.n_seeds for suite, table in tables.items()} == {
+        name: suite.n_paper_seeds for name, suite in SUITES.items()
+    }
     figure = tables["procgen"].figures["Continual/BossFight-v0", "trac"]
     assert (figure.mean, figure.standard_error, figure.mark) == (4.722, 1.027, "second")
     for suite, table in tables.items():
-        assert set(table.methods) <= {"vanilla", "cchain", *(algo.split("_", 1)[1] for algo in SUITES[suite].others)}
+        assert set(table.methods) <= set(paper_methods(suite))
 
 
 def test_the_papers_lengths_are_those_of_the_environments():
     lengths = read_tables()["gym_control"].lengths
-    assert lengths == {env_id: SUITES["gym_control"].length(env_id) for env_id in lengths}
+    assert lengths == {env_id: paper_length(env_id) for env_id in lengths}
     assert read_tables()["minatar"].lengths == {"Continual/MinAtar-v0": (3, 1_500_000)}
     assert read_tables()["dmc"].lengths["Continual/Dog-v0"] == (4, 1_000_000)
     assert set(read_tables()["procgen"].lengths.values()) == {(5, 2_000_000)}
@@ -219,7 +241,7 @@ def test_other_settings_are_refused(tmp_path, fields, name):
 
 def test_other_lengths_in_an_environment_are_refused(tmp_path):
     write(tmp_path, "cchain", [[0], [0]])
-    write(tmp_path, "vanilla", [[0]], n_tasks=1)
+    write(tmp_path, "vanilla", [[0]], n_tasks=1, task_names=["task 0"])
     with pytest.raises(ValueError, match=r"must not differ in `n_tasks`: .*cchain.* and .*vanilla.* have 2 and 1"):
         cells_in(tmp_path)
 
@@ -234,7 +256,7 @@ def test_a_seed_that_is_there_twice_is_refused(tmp_path):
 def test_a_cell_without_its_average_is_left_out_whole(tmp_path):
     write(tmp_path, "cchain", [[-1], [-1]])
     write(tmp_path, "cchain", [[-1], []], seed=1)
-    assert cells_of(read_results(tmp_path)) == ({}, [f"{ACROBOT}, cchain, seed 1: no return in task 1"])
+    assert make_cells(whole_results(tmp_path)) == ({}, [f"{ACROBOT}, cchain, seed 1: no return in task 1"])
 
 
 def test_table_by_hand(tmp_path):
@@ -268,9 +290,9 @@ def test_table_of_tasks_by_hand(tmp_path):
     write(tmp_path, "cchain", [[-10, -20], [-40]])
     write(tmp_path, "vanilla", [[-1], []], seed=1)
     write(tmp_path, "vanilla", [[-1], [-2]], seed=0)
-    assert table_rows(tasks_table(read_results(tmp_path), 1)) == [
-        ["method", "seed", "task 0", "task 1", "J(T)"],
-        ["---"] * 5,
+    results = whole_results(tmp_path)
+    assert returns_header(results[0].task_names) == ["method", "seed", "task 0", "task 1", "J(T)"]
+    assert returns_rows(results, GYM_LINES) == [
         ["PPO", "0", "-1.0", "-2.0", "-1.5"],
         ["PPO", "1", "-1.0", "–", "–"],
         ["C-CHAIN PPO", "0", "-15.0", "-40.0", "-27.5"],
@@ -316,7 +338,12 @@ def test_what_is_complete_over_environments(tmp_path):
 def test_ntk_table_by_hand(tmp_path):
     write(tmp_path, "cchain", [[0], [0]], metrics=[(50, "ntk/srank", 2.0), (100, "ntk/srank", 4.0), (150, "ntk/srank", 9.0)])
     write(tmp_path, "cchain", [[0], [0]], seed=1, metrics=[(50, "ntk/srank", 5.0), (150, "ntk/srank", 1.0)])
-    assert table_rows(ntk_table(read_results(tmp_path)))[2] == ["srank", "C-CHAIN PPO", "0 1", "4", "5"]
+    assert table_rows(quantities_table(whole_results(tmp_path), GYM_LINES, NTK))[2:] == [
+        ["NTK: srank", "C-CHAIN PPO", "0 1", "4", "5"],
+        *([quantity.label, "C-CHAIN PPO", "0 1", "–", "–"] for quantity in NTK[1:]),
+    ]
+    per_seed = quantities_table(whole_results(tmp_path), GYM_LINES, NTK[:1], per_seed=True)
+    assert table_rows(per_seed)[2] == ["NTK: srank", "C-CHAIN PPO", "0 1", "3 / 5", "9 / 1"]
 
 
 # Pictures and page
@@ -339,19 +366,19 @@ def test_which_task_a_metric_is_of(tmp_path):
     """The step that ends a task is of that task, and the last rollout goes beyond the end of the last."""
     metrics = [(steps, "ntk/srank", value) for value, steps in enumerate((50, 100, 101, 200, 210))]
     write(tmp_path, "cchain", [[0], [0]], metrics=metrics)
-    (result,) = read_results(tmp_path)
-    series = [[part.tolist() for part in result.metric_of_task("ntk/srank", task)] for task in (0, 1)]
+    (result,) = whole_results(tmp_path)
+    series = [[part.tolist() for part in result.metric_in_task("ntk/srank", task)] for task in (0, 1)]
     assert series == [[[50, 100], [0.0, 1.0]], [[101, 200, 210], [2.0, 3.0, 4.0]]]
-    assert result.metric_of_task("ntk/diagonal_sum", 0)[0].size == 0
+    assert result.metric_in_task("ntk/diagonal_sum", 0)[0].size == 0
 
 
 def test_a_rollout_over_a_switch_counts_in_both_tasks(tmp_path):
     """Its rows have the same environment step, that of its end, behind the switch."""
-    write(tmp_path, "cchain", [[0], [0]])
-    (result,) = read_results(tmp_path)
+    path = write(tmp_path, "cchain", [[0], [0]])
     rows = "timesteps,task_id,n_episodes,mean_return\n60,0,1,900\n120,0,1,910\n120,1,2,100\n240,1,1,110\n"
-    (result.path / "returns.csv").write_text(rows)
-    series = [[part.tolist() for part in result.returns_of_task(task)] for task in (0, 1)]
+    (path / "returns.csv").write_text(rows)
+    (result,) = whole_results(tmp_path)
+    series = [[part.tolist() for part in result.returns_in_task(task)] for task in (0, 1)]
     assert series == [[[60, 120], [900.0, 910.0]], [[120, 240], [100.0, 110.0]]]
 
 
@@ -359,15 +386,15 @@ def test_the_legend_of_all_methods_fits(tmp_path, monkeypatch):
     """Those of ProcGen, the most that there are."""
     import matplotlib.pyplot as plt
 
-    for method in METHODS:
-        write(tmp_path, method, [[0, 1], [0, 1]], suite="procgen", hyperparameters={})
+    for method in paper_methods("procgen"):
+        write(tmp_path, method, [[0, 1], [0, 1]], "Continual/Maze-v0", suite="procgen")
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
-    plot_learning_curves(read_results(tmp_path), tmp_path / "picture.png", 1, own_scales=False)
+    plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", suite_methods("procgen"))
     monkeypatch.undo()
     (figure,) = figures
     (legend,) = figure.legends
-    assert len(legend.get_texts()) == len(METHODS) == 9
+    assert len(legend.get_texts()) == 9
     box = legend.get_window_extent()
     assert 0 <= box.x0 and box.x1 <= figure.bbox.width
     plt.close(figure)
@@ -376,12 +403,66 @@ def test_the_legend_of_all_methods_fits(tmp_path, monkeypatch):
 def test_page_needs_nothing_beside_it(tmp_path):
     (tmp_path / "a.png").write_bytes(b"picture")
     page = html_page(
-        "# A title\n\n## Over `all` environments\n\n![words](a.png)\n\n| a | b |\n| --- | --- |\n| **1** | 2 |\n", tmp_path
+        "# A title\n\n## Over `all` environments\n\n![words](a.png)\n\n| a | b |\n| --- | --- |\n| **1** | <ins>2</ins> |\n",
+        {"a.png": tmp_path / "a.png"},
     )
     assert '<h2 id="over-all-environments">' in page and "<title>A title</title>" in page
     assert 'src="data:image/png;base64,cGljdHVyZQ=="' in page and 'alt="words"' in page
-    assert "<td><strong>1</strong></td>" in page
+    assert "<td><strong>1</strong></td>" in page and "<td><ins>2</ins></td>" in page
     assert not re.search(r"https?://|<script", page)
+
+
+def test_the_page_embeds_no_other_file_and_passes_no_html(tmp_path):
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    page = html_page(f"# <script>\n\n![x](secret.png) ![x]({tmp_path}/secret.png)\n\n<meta http-equiv=refresh>\n", {})
+    assert "c2VjcmV0" not in page and page.count('src="data:image/png;base64,"') == 2
+    assert not re.search("<script|<meta http-equiv=refresh", page)
+
+
+HOSTILE = [
+    "<meta http-equiv=refresh content=0><script>alert(1)</script>",
+    "![x](secret.png)",
+    "[x](javascript:alert(1))",
+    "a | b",
+    "a\n\n# b\n\n<b>",
+    "`` ` ![x](secret.png)",
+    "</title></table>",
+    "***a***",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_text_from_a_file_stays_text(text):
+    from markdown_it import MarkdownIt
+
+    render = MarkdownIt("commonmark", {"html": True}).enable("table").render
+    line = " ".join(text.split())
+    shown = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")
+    assert render(escaped(text)) == f"<p>{shown}</p>\n"
+    assert render(code(text)) == f"<p><code>{shown}</code></p>\n"
+    table = render(f"| {escaped(text)} | 2 |\n| --- | --- |\n")
+    assert table.count("<th>") == 2 and f"<th>{shown}</th>" in table
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_text_of_a_run_acts_as_markup(tmp_path, text, no_drawing):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "secret.png").write_bytes(b"secret")
+    fields = dict(
+        git_commit=text,
+        task_names=[text, "task 1"],
+        hyperparameters={"policy": text, text: 1},
+    )
+    write(tmp_path, "cchain", [[1], [1]], versions={text: text}, **fields)
+    write(tmp_path, "cchain", [[1], [1]], seed=1, versions={text: text, "torch": text}, **fields)
+    write(tmp_path, "trac", [[1], []], **fields)
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out", [text])
+    text_lines = (tmp_path / "out" / "report.md").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert not re.search(r"<script|<meta http-equiv=.?refresh|<b>|</title></table>|href=\"javascript|<em>a", page)
+    assert "c2VjcmV0" not in page and page.count("<h1") == 1 and "\n# b" not in text_lines
+    # Two tables have a column for each task, and no further one
+    assert page.count("<th>J(T)</th>") == 2 and page.count("<th>task 1</th>") == 1
 
 
 def make_results(folder):
@@ -397,12 +478,21 @@ def make_results(folder):
     write(folder, "oracle", [[-90, -80], [-100]])
 
 
-def test_whole_report(tmp_path, monkeypatch):
-    make_results(tmp_path / "results")
-    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path / "results"), "--budget", "smoke"])
-    main()
-    folder = tmp_path / "results" / "smoke"
-    text, page = (folder / "report.md").read_text(), (folder / "report.html").read_text()
+@pytest.fixture(scope="module")
+def whole_report(tmp_path_factory):
+    """Text and page of the report of :func:`make_results`, its folder, and the folder of the results."""
+    results = tmp_path_factory.mktemp("results")
+    make_results(results)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.report.estimates.N_RESAMPLES", 100)
+        patch.setattr(sys, "argv", ["report", "--results", str(results), "--budget", "smoke"])
+        main()
+    folder = results / "smoke"
+    return (folder / "report.md").read_text(), (folder / "report.html").read_text(), folder, results
+
+
+def test_whole_report(whole_report):
+    text, page, folder, results = whole_report
     assert "budget `smoke`" in text and "9 finished runs of 2 seeds" in text
     assert "- Not run: Continual ProcGen, Continual DeepMind Control, Continual MinAtar." in text
     assert "5 of the paper's 24 cells have runs. Of the 4 with more than one seed, 0 agree with the paper." in text
@@ -417,71 +507,67 @@ def test_whole_report(tmp_path, monkeypatch):
     assert set(re.findall(r'href="#(.*?)"', page)) == {"continual-gym-control"} <= set(re.findall(r'id="(.*?)"', page))
     assert not re.search(r"https?://|<script", page)
     # Beside the results, it is not one of them
-    assert len(read_results(tmp_path / "results")) == 9
+    assert len(whole_results(results)) == 9
 
 
 def test_report_of_a_single_seed(tmp_path):
     for method in ("vanilla", "cchain"):
         write(tmp_path, method, [[-90], [-100]])
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
     assert "| Acrobot-v1 | here | – | **-95.0** | – | – | – | **-95.0** |" in text
     assert "| C-CHAIN PPO | 0 | 1.09 | 1.09 | 1.09 | 0.00 |" in text and "| PPO | 0.50 | 0 of 1 | 1 of 1 |" in text
     assert not (tmp_path / "out" / "pictures" / "metrics_gym_control.png").exists()
 
 
-def test_report_of_a_method_alone(tmp_path):
+def test_report_of_a_method_alone(tmp_path, no_drawing):
     write(tmp_path, "trac", [[-90], []])
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
     assert f"Left out, as their J(T) is not defined:\n\n- {ACROBOT}, trac, seed 0: no return in task 1" in text
     assert "Over the environments" not in text and "Neural" not in text
 
 
-def test_versions_that_differ_are_told(tmp_path):
+def test_versions_that_differ_are_told(tmp_path, no_drawing):
     write(tmp_path, "trac", [[-90], [-90]])
     write(tmp_path, "trac", [[-90], [-90]], seed=1, versions={**VERSIONS, "torch": "2.9.0"})
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     told = "- † Acrobot-v1, TRAC: seeds 0 with torch 2.8.0; seeds 1 with torch 2.9.0"
     assert told in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_hyperparameters_are_told(tmp_path):
-    make_results(tmp_path)
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
-    text = (tmp_path / "out" / "report.md").read_text()
+def test_hyperparameters_are_told(whole_report, tmp_path, no_drawing):
+    text = whole_report[0]
     (line,) = [line for line in text.splitlines() if line.startswith("- C-CHAIN PPO (Acrobot-v1, CartPole-v1): ")]
     assert "`churn_coef: auto_1`, `target_churn_ratio: 10000.0`" in line and "learning_rate" not in line
     assert "shipped now" not in text
     write(tmp_path, "trac", [[0], [0]], hyperparameters={"learning_rate": 1.0})
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
     assert "- TRAC (Acrobot-v1): `learning_rate: 1.0`" in text
     assert "that are shipped now:**\n\n- Acrobot-v1, TRAC, seed 0\n\n" in text
 
 
-def test_seeds_that_lack_are_told(tmp_path):
-    make_results(tmp_path)
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
-    text = (tmp_path / "out" / "report.md").read_text()
+def test_seeds_that_lack_are_told(whole_report):
+    text = whole_report[0]
     assert (
         "Not all of the seeds 0 1 finished, for want of time or because they failed:\n\n- 0 alone: Acrobot-v1 Oracle\n\n"
         in text
     )
 
 
-def test_the_count_of_higher_means_is_of_the_seeds_that_are_compared(tmp_path):
+def test_the_count_of_higher_means_is_of_the_seeds_that_are_compared(tmp_path, no_drawing):
     """Of C-CHAIN seed 0, which is in both environments: 1 < 2 in the first, where seed 1 would turn it round."""
     write(tmp_path, "cchain", [[1], [1]])
     write(tmp_path, "cchain", [[9], [9]], seed=1)
     write(tmp_path, "vanilla", [[2], [2]])
     for method, value in (("cchain", 5), ("vanilla", 4)):
         write(tmp_path, method, [[value], [value]], env_id=CARTPOLE)
-    write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     assert "| PPO | 0.50 | 1 of 2 | 2 of 2 |" in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_runs_that_cannot_be_compared(tmp_path, monkeypatch, capsys):
+def test_runs_that_cannot_be_compared(tmp_path, monkeypatch, capsys, no_drawing):
     make_results(tmp_path)
     monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path), "--budget", "smoke"])
     write(tmp_path, "trac", [[0], [0]])
@@ -489,11 +575,70 @@ def test_runs_that_cannot_be_compared(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main()
     assert "Runs of one table must not differ in `hyperparameters`" in capsys.readouterr().err
-    file = next(tmp_path.rglob("run.json"))
-    file.write_text("")
-    with pytest.raises(SystemExit):
-        main()
-    assert f"{file} is not a result" in capsys.readouterr().err
+
+
+def edit_json(path, **fields):
+    file = path / "run.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **fields}))
+
+
+DAMAGES = {
+    "empty run.json": (lambda path: (path / "run.json").write_text(""), "is not a result"),
+    "run.json that is a list": (lambda path: (path / "run.json").write_text("[]"), "is not a result"),
+    "run.json of bytes": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe"), "is not a result"),
+    "missing returns": (lambda path: (path / "returns.csv").unlink(), "returns.csv is missing or damaged"),
+    "missing metrics": (lambda path: (path / "metrics.csv").unlink(), "metrics.csv is missing or damaged"),
+    "empty returns": (lambda path: (path / "returns.csv").write_text(""), "its first line must be timesteps,task_id"),
+    "torn returns": (
+        lambda path: (path / "returns.csv").write_text("timesteps,task_id,n_episodes,mean_return\n1,0,1,-1"),
+        "torn",
+    ),
+    "returns of words": (
+        lambda path: (path / "returns.csv").write_text("timesteps,task_id,n_episodes,mean_return\n1,0,1,x\n"),
+        "could not convert",
+    ),
+    "short row of metrics": (lambda path: (path / "metrics.csv").write_text("timesteps,name,value\n1,a\n"), "metrics.csv"),
+    "unknown method": (lambda path: edit_json(path, method="nonsense"), "unknown method 'nonsense' in gym_control"),
+    "unknown suite": (lambda path: edit_json(path, suite="nonsense"), "unknown suite 'nonsense'"),
+    "seed as a string": (lambda path: edit_json(path, seed="0"), "`seed` must be int; got '0'"),
+    "seed as a truth value": (lambda path: edit_json(path, seed=True), "`seed` must be int; got True"),
+    "negative seed": (lambda path: edit_json(path, seed=-1), "`seed` is out of range: -1"),
+    "no time": (lambda path: edit_json(path, seconds=0), "`seconds` is out of range: 0"),
+    "versions that are no texts": (lambda path: edit_json(path, versions={"torch": 2}), "`versions` must be"),
+    "too few names of tasks": (lambda path: edit_json(path, task_names=["task 0"]), "`task_names` must be 2; got 1"),
+    "names of tasks that are numbers": (lambda path: edit_json(path, task_names=[0, 1]), "`task_names` must be"),
+    "an unknown field": (lambda path: edit_json(path, nonsense=1), "nonsense"),
+    "an unknown environment": (
+        lambda path: edit_json(path, env_id="Continual/Pendulum-v1"),
+        "no Continual/Pendulum-v1 in gym_control",
+    ),
+    "a variant": (lambda path: edit_json(path, variant="orthogonal", overrides=["a:1"]), "but with a:1"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_run_that_cannot_be_read_is_named_and_left_out(tmp_path, monkeypatch, capsys, damage, no_drawing):
+    write(tmp_path, "vanilla", [[-90], [-100]])
+    path = write(tmp_path, "cchain", [[-90], [-100]])
+    spoil, reason = DAMAGES[damage]
+    spoil(path)
+    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path), "--budget", "smoke"])
+    main()
+    printed = capsys.readouterr().out
+    assert f"Left out: {path}" in printed and reason in printed
+    text = (tmp_path / "smoke" / "report.md").read_text()
+    assert "1 finished runs of a single seed" in text
+    assert f"These are left out:\n\n- {escaped(path)}" in text
+
+
+def test_a_report_of_nothing_is_an_error(tmp_path, monkeypatch, capsys):
+    path = write(tmp_path, "cchain", [[-90], [-90]])
+    monkeypatch.setattr(sys, "argv", ["report", "--results", str(tmp_path), "--budget", "smoke"])
+    for env_id in ("Continual/Pendulum-v1", 3):
+        edit_json(path, env_id=env_id)
+        with pytest.raises(SystemExit):
+            main()
+        assert str(path) in capsys.readouterr().err
 
 
 def test_a_budget_that_is_not_there(tmp_path, monkeypatch, capsys):
@@ -504,7 +649,100 @@ def test_a_budget_that_is_not_there(tmp_path, monkeypatch, capsys):
     assert "no results of --budget reduced" in capsys.readouterr().err
 
 
-def test_an_environment_that_the_paper_does_not_have_is_refused(tmp_path):
-    write(tmp_path, "cchain", [[-90], [-90]], env_id="Continual/Pendulum-v1")
-    with pytest.raises(ValueError, match=r"no Continual/Pendulum-v1 in suite 'gym_control': .*seed_0"):
-        write_report(read_results(tmp_path), "smoke", tmp_path / "out")
+# Tables and pictures of single runs
+
+
+def test_means_and_costs_by_hand(tmp_path):
+    write(tmp_path, "cchain", [[-10, -20], [-40]], seconds=100.0, peak_memory=2_500_000_000)
+    write(tmp_path, "vanilla", [[-5], [0]], seed=1)
+    write(tmp_path, "vanilla", [[-15], [-40]])
+    results = whole_results(tmp_path)
+    assert mean_rows(results, GYM_LINES) == [
+        ["**PPO**", "**mean**", "**-10.0**", "**-20.0**", "**-15.0**"],
+        ["**C-CHAIN PPO**", "**mean**", "**-15.0**", "**-40.0**", "**-27.5**"],
+    ]
+    assert average_cells([-300.0, -1.0]) == ["-300.0", "-1.0", "-150.5"]
+    assert table_rows(cost_table(results, GYM_LINES))[2:] == [
+        ["PPO", "0", "0", "–"],
+        ["PPO", "1", "0", "–"],
+        ["C-CHAIN PPO", "0", "2", "2.5 GB"],
+    ]
+
+
+def test_smoothed_by_hand():
+    assert smoothed(np.array([1.0, 3.0, 8.0, 1.0]), window=2).tolist() == [1.0, 2.0, 5.5, 4.5]
+
+
+def test_band_of_what_has_no_logarithm():
+    _, mean, _, high = band([(np.array([0.0, 1.0]), np.array([0.0, -1e-15]))] * 2, logarithmic=True)
+    assert (0 <= mean).all() and (high < 1e-300).all()
+
+
+def test_what_is_logged_a_rollout_later_counts_where_it_was_made(tmp_path):
+    write(tmp_path, "cchain", [[0, 1], [0, 1]], metrics=[(steps, "churn/coef", steps) for steps in (20, 110, 120)])
+    (result,) = whole_results(tmp_path)
+    # Rollouts of 10 steps
+    assert Quantity("churn/coef", "", delay=1).series(result, 0)[1].tolist() == [20, 110]
+    assert Quantity("churn/coef", "", delay=0).series(result, 0)[1].tolist() == [20]
+    assert RETURNS.series(result, 1)[1].tolist() == [0, 1]
+
+
+FRAME = np.zeros((20, 30, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "suite, env_id, looks, n_axes",
+    [
+        ("gym_control", ACROBOT, [], 1),
+        ("gym_control", ACROBOT, [TaskLook(-60.0, None), TaskLook(-70.0, None)], 1),
+        ("dmc", "Continual/Walker-v0", [], 2),
+        ("dmc", "Continual/Walker-v0", [TaskLook(-60.0, FRAME), TaskLook(-70.0, FRAME)], 4),
+    ],
+)
+def test_learning_curves(tmp_path, monkeypatch, suite, env_id, looks, n_axes):
+    import matplotlib.pyplot as plt
+
+    for method in ("vanilla", "cchain"):
+        write(tmp_path, method, [[0, 1], [0]], env_id, suite=suite)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    plot_learning_curves(whole_results(tmp_path), tmp_path / "new" / "a.png", suite_methods(suite), "title", looks)
+    monkeypatch.undo()
+    assert (tmp_path / "new" / "a.png").read_bytes().startswith(b"\x89PNG")
+    (figure,) = figures
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert set(labels) == {"PPO", "C-CHAIN PPO", *(["random policy"] if looks else [])}
+    assert len(figure.axes) == n_axes
+    plt.close(figure)
+
+
+def test_a_picture_of_quantities_with_variants(tmp_path, monkeypatch):
+    import matplotlib.pyplot as plt
+
+    from benchmarks.plasticity import LINES
+
+    metrics = [(steps, quantity.name, steps) for steps in (50, 150) for quantity in PLASTICITY[1:]]
+    for name, line in LINES.items():
+        write(tmp_path, line.name, [[0, 1], [0]], variant=name, metrics=metrics)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    plot_quantities(whole_results(tmp_path), tmp_path / "a.png", LINES, PLASTICITY, "title", window=5)
+    monkeypatch.undo()
+    (figure,) = figures
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [line.label for line in LINES.values()]
+    assert [axes.get_title() for axes in figure.axes] == [quantity.label for quantity in PLASTICITY]
+    assert [axes.get_yscale() == "log" for axes in figure.axes] == [quantity.logarithmic for quantity in PLASTICITY]
+    plt.close(figure)
+
+
+def test_the_committed_results_make_the_committed_report(tmp_path, monkeypatch, no_drawing):
+    """Apart from names of classes, which the report shows as they are now."""
+    monkeypatch.setattr("benchmarks.report.estimates.N_RESAMPLES", 2000)
+    folder = ROOT / "benchmarks" / "results" / "reduced"
+    write_report(whole_results(folder), "reduced", tmp_path)
+    before = (folder / "report.md").read_text().replace("sb3_cchain.baselines.", "sb3_cchain.methods.")
+
+    def tables(text):
+        return [line for line in text.splitlines() if line.startswith("|")]
+
+    assert tables((tmp_path / "report.md").read_text()) == tables(before)
