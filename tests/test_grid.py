@@ -1,5 +1,6 @@
-"""The grid of the paper: its runs, their results, and that neither is lost or made twice when something dies."""
+"""The grid: its runs, their results, and that neither is lost or made twice when something dies."""
 
+import json
 import os
 import re
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,40 +16,45 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks.grid import GridRun, Rates, grid_runs, length
-from benchmarks.grid_view import Failure, GridView, duration
-from benchmarks.results import METHODS, Result, in_json, read_result, read_results, write_result
+from benchmarks.grid.executor import RETRIES, LocalBackend, complete, gpu_places
+from benchmarks.grid.plan import Rates, grid_runs, run_length
+from benchmarks.grid.ray_backend import RayBackend, count_slots
+from benchmarks.grid.results import RENAMED, Result, find_result, read_result, read_results, write_result
+from benchmarks.grid.run import ROOT, Run, as_json, make_run, paper_methods, suite_methods
+from benchmarks.grid.suites import SUITES, task_names
+from benchmarks.grid.training import Training, TrainingFailed
+from benchmarks.grid.view import Failure, View, duration
 from benchmarks.run import main
-from benchmarks.runs import Run
-from benchmarks.scheduler import RETRIES, ROOT, RunFailed, complete_grid, connect, import_ray, slots, train
-from benchmarks.suites import SUITES
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from sb3_cchain.methods.registry import METHOD_NAMES
+from tests.fake_training import fake_program
 
-GRID_RUN = GridRun("gym_control", "Continual/CartPole-v1", "cchain", 0, "smoke", 2, 800, ("task 0", "task 1"))
+RUN = Run("gym_control", "Continual/CartPole-v1", "cchain", 0, 2, 800, "smoke")
 ROWS = [
     {"timesteps": 800, "task_id": 0, "n_episodes": 4, "mean_return": 20.0},
     {"timesteps": 1600, "task_id": 0, "n_episodes": 2, "mean_return": 30.0},
 ]
 
 
-def make_result(folder, run=GRID_RUN, seconds=10.0, steps_per_second=160.0, **settings):
+def make_result(folder, run=RUN, **fields):
     """As of a finished run."""
+    settings = {name: value for name, value in fields.items() if name in vars(run)}
+    changed = replace(run, **settings)
     return Result(
-        path=run.path(folder),
-        suite=run.suite,
-        method=run.method,
-        budget=run.budget,
-        task_names=list(run.task_names),
-        task_boundaries=[800, 1600],
-        command=["sb3-cchain", "train"],
-        versions={"sb3-cchain": "0", "stable-baselines3": "0", "gymnasium": "0", "torch": "0", "numpy": "0", "python": "0"},
-        git_commit=None,
-        started="2026-01-01T00:00:00+00:00",
-        finished="2026-01-01T00:00:10+00:00",
-        seconds=seconds,
-        steps_per_second=steps_per_second,
-        peak_memory=None,
-        **{**run.settings, **settings},
+        **{
+            **vars(changed),
+            "path": run.path_in(folder),
+            "task_names": [f"task {task}" for task in range(changed.n_tasks)],
+            "hyperparameters": run.settings["hyperparameters"],
+            "command": ["sb3-cchain", "train"],
+            "versions": {"sb3-cchain": "0", "stable-baselines3": "0", "gymnasium": "0", "torch": "0", "numpy": "0"},
+            "git_commit": None,
+            "started": "2026-01-01T00:00:00+00:00",
+            "finished": "2026-01-01T00:00:10+00:00",
+            "seconds": 10.0,
+            "peak_memory": None,
+            **fields,
+        }
     )
 
 
@@ -58,7 +65,8 @@ def test_results_are_read_as_they_were_written(tmp_path):
     result = make_result(tmp_path)
     assert result.path == tmp_path / "smoke" / "gym_control" / "Continual-CartPole-v1" / "cchain" / "seed_0"
     write_result(result, ROWS, [{"timesteps": 800, "name": "churn/coef", "value": "1.5"}])
-    assert read_results(tmp_path) == read_results(tmp_path / "smoke") == [result] == [read_result(result.path)]
+    assert read_results(tmp_path) == read_results(tmp_path / "smoke") == ([result], {})
+    assert read_result(result.path) == result == find_result(RUN, tmp_path) and result.steps_per_second == 160.0
     assert result.returns == ROWS and result.metrics == {"churn/coef": [(800, 1.5)]}
     averages = result.task_averages()
     assert averages[0] == 25.0 and averages[1] != averages[1]
@@ -69,7 +77,7 @@ def test_results_are_read_as_they_were_written(tmp_path):
 
 
 def test_json_without_infinity():
-    assert in_json({"a": float("inf"), "b": [1.5, (2,)], 3: None}) == {"a": "inf", "b": [1.5, [2]], "3": None}
+    assert as_json({"a": float("inf"), "b": [1.5, (2,)], 3: None}) == {"a": "inf", "b": [1.5, [2]], "3": None}
 
 
 def test_a_result_is_whole_or_not_there(tmp_path, monkeypatch):
@@ -79,19 +87,23 @@ def test_a_result_is_whole_or_not_there(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             write_result(result, ROWS, [])
     # What it left is no result, and in nobody's way
-    assert len(list(result.path.parent.iterdir())) == 1 and read_results(tmp_path) == [] and GRID_RUN.result(tmp_path) is None
+    assert (
+        len(list(result.path.parent.iterdir())) == 1
+        and read_results(tmp_path) == ([], {})
+        and find_result(RUN, tmp_path) is None
+    )
     write_result(result, ROWS, [])
-    assert read_results(tmp_path) == [result]
+    assert read_results(tmp_path) == ([result], {})
 
 
 def test_the_first_of_equal_results_stays_and_one_of_other_settings_is_replaced(tmp_path):
     first = make_result(tmp_path)
     write_result(first, ROWS, [])
     write_result(make_result(tmp_path, seconds=99.0), [], [])
-    assert read_results(tmp_path) == [first] and first.returns == ROWS
+    assert read_results(tmp_path) == ([first], {}) and first.returns == ROWS
     other = make_result(tmp_path, steps_per_task=400)
     write_result(other, [], [])
-    assert read_results(tmp_path) == [other] and other.returns == []
+    assert read_results(tmp_path) == ([other], {}) and other.returns == []
     assert [path.name for path in first.path.parent.iterdir()] == ["seed_0"]
 
 
@@ -100,7 +112,7 @@ def test_writers_at_once_leave_one_whole_result(tmp_path, same):
     results = [make_result(tmp_path, steps_per_task=800 if same else 100 + i) for i in range(16)]
     with ThreadPoolExecutor(16) as pool:
         list(pool.map(lambda result: write_result(result, ROWS, []), results))
-    (written,) = read_results(tmp_path)
+    (written,), _ = read_results(tmp_path)
     assert written in results and written.returns == ROWS
     assert [path.name for path in written.path.parent.iterdir()] == ["seed_0"]
 
@@ -108,20 +120,58 @@ def test_writers_at_once_leave_one_whole_result(tmp_path, same):
 def test_a_result_counts_under_its_settings_alone(tmp_path):
     result = make_result(tmp_path)
     write_result(result, ROWS, [])
-    assert GRID_RUN.result(tmp_path) == result
-    for change in (dict(seed=1), dict(method="vanilla"), dict(budget="paper"), dict(n_tasks=3), dict(steps_per_task=801)):
-        assert replace(GRID_RUN, **change).result(tmp_path) is None
-    hyperparameters = {**GRID_RUN.settings["hyperparameters"], "learning_rate": 1.0}
+    assert find_result(RUN, tmp_path) == result
+    for change in (
+        *(dict(seed=1), dict(method="vanilla"), dict(experiment="paper"), dict(n_tasks=3), dict(steps_per_task=801)),
+        *(dict(eval_freq=5), dict(overrides=("n_epochs:1",)), dict(variant="orthogonal")),
+    ):
+        assert find_result(replace(RUN, **change), tmp_path) is None
+    hyperparameters = {**RUN.settings["hyperparameters"], "learning_rate": 1.0}
     write_result(make_result(tmp_path, hyperparameters=hyperparameters), ROWS, [])
-    assert GRID_RUN.result(tmp_path) is None
+    assert find_result(RUN, tmp_path) is None
+
+
+def test_a_variant_has_a_folder_of_its_own(tmp_path):
+    variant = replace(RUN, variant="orthogonal", overrides=("churn_component:'orthogonal'",))
+    for run in (RUN, variant):
+        write_result(make_result(tmp_path, run), ROWS, [])
+    assert find_result(variant, tmp_path).path == tmp_path / "smoke/gym_control/Continual-CartPole-v1/orthogonal/seed_0"
+    assert find_result(variant, tmp_path).overrides == variant.overrides and find_result(RUN, tmp_path).line == "cchain"
+
+
+def test_older_results_are_read(tmp_path):
+    """They say "budget", have the evaluations in their command alone, and old names of classes."""
+    run = Run("minatar", "Continual/MinAtar-v0", "oracle", 0, 2, 800, "smoke", eval_freq=400)
+    result = make_result(tmp_path, run, command=["sb3-cchain", "train", "--eval-freq", "400"])
+    write_result(result, ROWS, [])
+    file = result.path / "run.json"
+    fields = {name: value for name, value in json.loads(file.read_text()).items()}
+    for name in ("eval_freq", "variant", "overrides"):
+        del fields[name]
+    fields["budget"] = fields.pop("experiment")
+    text = json.dumps(fields)
+    for old, new in RENAMED.items():
+        text = text.replace(new, old)
+    assert "sb3_cchain.baselines.Oracle" in text and "sb3_cchain.common." in text
+    file.write_text(text)
+    # Several old names may have become one new name
+    assert find_result(run, tmp_path) == result and find_result(replace(run, eval_freq=800), tmp_path) is None
+
+
+def test_the_committed_results_count(capsys):
+    arguments = ["--suite", "gym_control", "--budget", "reduced", "--method", "cchain", "vanilla", "oracle", "--seeds", "2"]
+    assert main([*arguments, "--dry-run", "--results", str(ROOT / "benchmarks" / "results")]) == 0
+    assert "24 runs, 24 of them done." in capsys.readouterr().out
 
 
 # --- The grid -----------------------------------------------------------------------------------------------------------
 
 
 def test_methods():
-    assert tuple(SUITES["procgen"].methods) == METHODS
-    assert list(SUITES["gym_control"].methods.items()) == [
+    assert paper_methods("procgen") == [
+        name for name in METHOD_NAMES if name not in ("parseval", "shrink_and_perturb", "crelu")
+    ]
+    assert [(name, suite_methods("gym_control")[name].algo) for name in paper_methods("gym_control")] == [
         ("oracle", "ppo_oracle"),
         ("vanilla", "ppo"),
         ("trac", "ppo_trac"),
@@ -129,7 +179,10 @@ def test_methods():
         ("l2_init", "ppo_l2_init"),
         ("cchain", "ppo_cchain"),
     ]
-    assert SUITES["minatar"].methods == {"oracle": "double_dqn_oracle", "vanilla": "double_dqn", "cchain": "dqn_cchain"}
+    minatar = {name: suite_methods("minatar")[name].algo for name in paper_methods("minatar")}
+    assert minatar == {"oracle": "double_dqn_oracle", "vanilla": "double_dqn", "cchain": "dqn_cchain"}
+    # Methods that the paper does not have, too, but of the suite's algorithm alone
+    assert "crelu" in suite_methods("gym_control") and "trac" not in suite_methods("minatar")
 
 
 def test_the_grid_of_gym_control():
@@ -147,16 +200,15 @@ def test_the_grid_of_gym_control():
         for method in ("cchain", "vanilla")
         for env in (("Continual/CartPole-v1", 10, 160_000), ("Continual/MountainCar-v0", 5, 320_000))
     ]
-    assert grid[0].task_names == tuple(f"task {i}" for i in range(10))
     assert len(grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
 
 
 def test_lengths():
-    assert length("gym_control", "Continual/Acrobot-v1", "reduced") == (4, 64_000)
-    assert length("gym_control", "Continual/MountainCar-v0", "reduced") == (2, 128_000)
-    assert length("minatar", "Continual/MinAtar-v0", "paper") == (3, 1_500_000)
-    assert length("minatar", "Continual/MinAtar-v0", "reduced") == (3, 150_000)
-    assert length("minatar", "Continual/MinAtar-v0", "smoke") == (2, 200)
+    assert run_length("gym_control", "Continual/Acrobot-v1", "reduced") == (4, 64_000)
+    assert run_length("gym_control", "Continual/MountainCar-v0", "reduced") == (2, 128_000)
+    assert run_length("minatar", "Continual/MinAtar-v0", "paper") == (3, 1_500_000)
+    assert run_length("minatar", "Continual/MinAtar-v0", "reduced") == (3, 150_000)
+    assert run_length("minatar", "Continual/MinAtar-v0", "smoke") == (2, 200)
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
@@ -166,34 +218,90 @@ def test_the_grid_of_all_suites():
     assert counts == dict(gym_control=4 * 6 * 6, procgen=16 * 9 * 6, dmc=3 * 3 * 12, minatar=1 * 3 * 12)
     assert {run.env_id for run in grid} == {f"Continual/{name}" for name in CONTINUAL_ENVS}
     assert all(run.settings["hyperparameters"] for run in grid)
-    names = {run.env_id: run.task_names for run in grid}
-    assert names["Continual/Maze-v0"] == ("level 20", "level 21", "level 22", "level 23", "level 24")
-    assert names["Continual/Dog-v0"] == ("stand", "walk", "run", "trot")
 
 
-def test_a_grid_run_is_the_command_that_a_user_would_type(tmp_path):
-    run = GRID_RUN.run(tmp_path)
-    assert run == Run("ppo_cchain", "Continual/CartPole-v1", 0, 2, 800, tmp_path, ("n_tasks:2", "offset_seed:0"))
-    assert "--hyperparams" not in run.arguments
-    evaluated = GridRun("minatar", "Continual/MinAtar-v0", "vanilla", 3, "reduced", 3, 150_000, ())
-    assert evaluated.run(tmp_path).eval_freq == 5000
-    assert evaluated.run(tmp_path, "cuda").arguments[9:13] == ["--num-threads", "1", "--device", "cuda"]
+def test_suites_cover_the_environments():
+    env_ids = [env_id for suite in SUITES.values() for env_id in suite.env_ids]
+    assert sorted(env_ids) == sorted(f"Continual/{name}" for name in CONTINUAL_ENVS)
+    assert {name: len(suite.env_ids) for name, suite in SUITES.items()} == dict(gym_control=4, procgen=16, dmc=3, minatar=1)
+    for suite in SUITES.values():
+        assert suite.demo.env_id in suite.env_ids and "vanilla" in suite.rates
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
+@pytest.mark.parametrize(
+    "suite, env_id, names",
+    [
+        ("procgen", "Continual/Maze-v0", ("level 20", "level 21")),
+        ("dmc", "Continual/Walker-v0", ("stand", "walk")),
+        ("gym_control", "Continual/CartPole-v1", ("task 0", "task 1")),
+        ("minatar", "Continual/MinAtar-v0", ("SpaceInvaders", "Asterix")),
+    ],
+)
+def test_names_of_tasks(suite, env_id, names):
+    assert task_names(suite, env_id, 2) == names
+
+
+def test_a_run_is_the_command_that_a_user_would_type():
+    arguments = RUN.arguments(Path("logs"))
+    assert " ".join(arguments) == (
+        "train --algo ppo_cchain --env Continual/CartPole-v1 --seed 0 --n-timesteps 1600 --num-threads 1 --device cpu "
+        "--eval-freq -1 --eval-episodes 10 --log-folder logs --tensorboard-log logs/tensorboard --verbose 0 "
+        "--env-kwargs steps_per_task:800 n_tasks:2 offset_seed:0"
+    )
+    overridden = replace(RUN, overrides=("n_epochs:1",)).arguments(Path("logs"), "cuda")
+    assert overridden[-2:] == ["--hyperparams", "n_epochs:1"] and overridden[9:13] == [
+        "--num-threads",
+        "1",
+        "--device",
+        "cuda",
+    ]
+    evaluated = make_run("minatar", "Continual/MinAtar-v0", "vanilla", 3, 3, 150_000, "reduced")
+    assert evaluated.eval_freq == 5000 and evaluated.algo == "double_dqn"
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(suite="dmc", env_id="Continual/Walker-v0", n_tasks=5), "`n_tasks` must be at most 3, the tasks of .*; got 5"),
+        (dict(seed=-1), "`seed` must be at least 0; got -1"),
+        (dict(steps_per_task=0), "`steps_per_task` must be at least 1; got 0"),
+        (dict(env_id="Continual/Maze-v0"), "`env_id` must be one of Continual/CartPole-v1, .*; got Continual/Maze-v0"),
+        (dict(method="redo"), "`method` must be one of oracle, vanilla, .*; got redo"),
+        (
+            dict(suite="minatar", env_id="Continual/MinAtar-v0", method="vanilla", steps_per_task=100, eval_freq=200),
+            "between 1 and `steps_per_task`, which is 100; got 200",
+        ),
+        (
+            dict(suite="minatar", env_id="Continual/MinAtar-v0", method="vanilla", steps_per_task=20),
+            "between 1 and `steps_per_task`, which is 20; got None",
+        ),
+    ],
+)
+def test_runs_that_cannot_be_are_refused(changes, message):
+    arguments = {name: getattr(RUN, name) for name in ("suite", "env_id", "method", "seed", "n_tasks", "steps_per_task")}
+    with pytest.raises(ValueError, match=message):
+        make_run(**{**arguments, "experiment": "smoke", **changes})
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--env", "Continual/Maze-v0"], "--env must be of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0"),
-        (["--method", "redo"], "--method must be of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
+        (
+            ["--env", "Continual/Maze-v0"],
+            "--env must be one of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0",
+        ),
+        (["--method", "redo"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
         (["--seeds", "0"], "--seeds must be at least 1; got 0"),
         (["--gpus-per-run", "-1"], "--gpus-per-run must be from 0.0001 to 1, or a whole number; got -1"),
         (["--gpus-per-run", "1.5"], "--gpus-per-run must be .*; got 1.5"),
         (["--gpus-per-run", "1e-5"], "--gpus-per-run must be .*; got 1e-05"),
         (["--gpus-per-run", "nan"], "--gpus-per-run must be .*; got nan"),
-        (["--results", __file__], "Not a directory: .*test_grid.py"),
+        (["--results", __file__], "--results must be a folder that can be written to; got .*test_grid.py"),
         (["--cpus", "0"], "--cpus must be at least 1"),
         (["--cpus", "2", "--address", "auto"], "goes without --address"),
-        ([], r'The grid needs Ray .*: pip install -e ".\[cluster\]"'),
+        (["--address", "auto"], r'--address needs Ray .*: pip install -e ".\[cluster\]"'),
+        (["--gpus-per-run", "99"], "--gpus-per-run must be at most the GPUs of this machine, .*; got 99"),
     ],
 )
 def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monkeypatch):
@@ -208,11 +316,10 @@ def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monke
 def test_an_empty_grid_is_an_error(capsys):
     with pytest.raises(SystemExit):
         main(["--suite", "all", "--method", "redo", "--env", "Continual/Acrobot-v1"])
-    assert "--method must be one that is compared in Continual/Acrobot-v1; got redo" in capsys.readouterr().err
+    assert "--method must be one with hyperparameters for Continual/Acrobot-v1; got redo" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("benchmarks.run.import_ray", lambda: None)
     monkeypatch.setattr("tempfile.TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError("Read-only file system")))
     with pytest.raises(SystemExit):
         main(["--suite", "gym_control", "--results", str(tmp_path / "new")])
@@ -221,19 +328,19 @@ def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, c
 
 
 def test_a_damaged_result_is_named(tmp_path, capsys):
-    GRID_RUN.path(tmp_path).mkdir(parents=True)
+    RUN.path_in(tmp_path).mkdir(parents=True)
     for text in ("", "{}"):
-        (GRID_RUN.path(tmp_path) / "run.json").write_text(text)
+        (RUN.path_in(tmp_path) / "run.json").write_text(text)
         with pytest.raises(SystemExit):
             main(["--suite", "gym_control", "--budget", "smoke", "--dry-run", "--results", str(tmp_path)])
-        assert f"{GRID_RUN.path(tmp_path) / 'run.json'} is not a result" in capsys.readouterr().err
+        assert f"{RUN.path_in(tmp_path) / 'run.json'} is not a result" in capsys.readouterr().err
 
 
 def test_results_that_will_be_replaced_are_told(tmp_path, capsys):
     result = make_result(tmp_path, hyperparameters={}, seed=0)
     write_result(result, ROWS, [])
     assert main(["--suite", "gym_control", "--budget", "smoke", "--dry-run", "--results", str(tmp_path)]) == 0
-    assert f"{result.path} is of other hyperparameters, and will be replaced." in capsys.readouterr().out
+    assert f"{result.path} has other hyperparameters, and will be replaced." in capsys.readouterr().out
 
 
 def test_dry_run(tmp_path, capsys, monkeypatch):
@@ -246,9 +353,9 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
     assert lines[0].split() == "CartPole-v1 vanilla seed 0 2 x 800 steps 4 s".split()
     assert lines[1].split() == "CartPole-v1 cchain seed 0 2 x 800 steps done in 10 s".split()
     assert lines[2].startswith("2 runs, 1 of them done. The other 1 take 4 s on a core")
-    assert lines[3].startswith("1 of the results are of sb3-cchain 0")
+    assert lines[3].startswith("1 of the results were made with sb3-cchain 0")
     # Nothing to do needs no Ray
-    write_result(make_result(tmp_path, replace(GRID_RUN, method="vanilla")), ROWS, [])
+    write_result(make_result(tmp_path, replace(RUN, method="vanilla")), ROWS, [])
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("All 2 runs are done.")
 
@@ -257,18 +364,18 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
 
 
 def test_rates_by_hand(tmp_path):
-    acrobot = replace(GRID_RUN, env_id="Continual/Acrobot-v1", budget="reduced")
-    paper = replace(GRID_RUN, budget="paper", n_tasks=1, steps_per_task=1000)
+    acrobot = replace(RUN, env_id="Continual/Acrobot-v1", experiment="reduced")
+    paper = replace(RUN, experiment="paper", n_tasks=1, steps_per_task=1000)
     # Nothing known: 430 steps per second, 500 of Vanilla
     assert Rates([]).seconds(paper) == pytest.approx(1000 / 430)
     assert Rates([]).seconds(replace(paper, method="weight_clipping")) == pytest.approx(2.0)
-    results = [make_result(tmp_path, GRID_RUN, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
+    results = [make_result(tmp_path, RUN, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
     results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
     # Of the suite, 3200 steps in 64 seconds, not of smoke runs, though of the same environment
     assert Rates(results).seconds(paper) == pytest.approx(20.0)
-    results.append(make_result(tmp_path, replace(GRID_RUN, budget="reduced"), seconds=16.0))
+    results.append(make_result(tmp_path, replace(RUN, experiment="reduced"), seconds=16.0))
     assert Rates(results).seconds(paper) == pytest.approx(10.0)
-    assert Rates(results).seconds(GRID_RUN) == pytest.approx(1000.0)
+    assert Rates(results).seconds(RUN) == pytest.approx(1000.0)
 
 
 def test_durations():
@@ -280,9 +387,9 @@ def test_durations():
 def test_time_left_by_hand(monkeypatch):
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    some = [replace(GRID_RUN, seed=seed, steps_per_task=4300) for seed in range(5)]  # 20 seconds each at 430 steps per second
+    some = [replace(RUN, seed=seed, steps_per_task=4300) for seed in range(5)]  # 20 seconds each at 430 steps per second
     console = Console(record=True, width=200)
-    view = GridView(some, n_done=3, rates=Rates([]), console=console)
+    view = View(some, n_done=3, rates=Rates([]), console=console)
     view.slots = 2
     assert view.time_left() == pytest.approx(50.0)
     view.start(some[0])
@@ -291,7 +398,7 @@ def test_time_left_by_hand(monkeypatch):
     assert view.time_left() == pytest.approx((5 + 5 + 60) / 2)
     now = 130.0
     view.finish(some[0], 30.0)
-    # They take one and a half times as long as was believed: nothing is left of the second
+    # They take one and a half times as long as estimated: nothing is left of the second
     assert view.time_left() == pytest.approx((0 + 3 * 30) / 2)
     view.fail(Failure(some[1], "ValueError: [no]", "/logs/log.txt", "elsewhere"), again=True)
     assert view.waiting[0] == some[1]
@@ -300,6 +407,7 @@ def test_time_left_by_hand(monkeypatch):
     view.start(some[2])
     view.skip(some[3])
     assert view.time_left() == pytest.approx(30.0)
+    view.progress = {some[2]: "50%, task 1, return -3"}
     console.print(view.render())
     shown = console.export_text().splitlines()
     assert shown[0] == "4 of 8: CartPole-v1 cchain seed 0 done in 30 s, 45 s left"
@@ -307,34 +415,52 @@ def test_time_left_by_hand(monkeypatch):
     assert shown[1].strip() == f"{failure} (tried again)"
     assert shown[2].strip() == failure and shown[-1].strip() == failure
     assert shown[3].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
-    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s".split()
+    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s 50%, task 1, return -3".split()
 
 
 def test_an_address_at_which_nothing_answers():
+    pytest.importorskip("ray")
     with pytest.raises(ConnectionError, match=r"--address must be that of a Ray cluster; got 127.0.0.1:1: .*refused"):
-        connect(None, "127.0.0.1:1", None, 0.0)
+        RayBackend("127.0.0.1:1")
 
 
 def test_slots_by_hand():
-    assert slots({"CPU": 8.0, "GPU": 1.0}, 0.0) == 8
-    assert slots({"CPU": 8.0, "GPU": 1.0}, 0.25) == 4
-    assert slots({"CPU": 2.0, "GPU": 1.0}, 0.1) == 2
-    assert slots({}, 0.0) == 1
+    assert count_slots({"CPU": 8.0, "GPU": 1.0}, 0.0) == 8
+    assert count_slots({"CPU": 8.0, "GPU": 1.0}, 0.25) == 4
+    assert count_slots({"CPU": 2.0, "GPU": 1.0}, 0.1) == 2
+    assert count_slots({}, 0.0) == 1
+
+
+def test_places_on_gpus_by_hand():
+    assert gpu_places(["0", "1"], 0.5) == ["0", "1", "0", "1"]
+    assert gpu_places(["0", "1"], 1.0) == ["0", "1"]
+    assert gpu_places(["0", "1", "2", "3", "4"], 2.0) == ["0,1", "2,3"]
+    assert gpu_places(["3"], 0.3) == ["3"] * 3
 
 
 # --- Training -----------------------------------------------------------------------------------------------------------
 
 
-def train_smoke(suite, env_id, method, folder):
+def train_smoke(suite, env_id, method, folder, *overrides):
+    """Of overrides, those that make it shorter."""
     (run,) = grid_runs([suite], [env_id], [method], budget="smoke")
-    finished = train(run, folder / "logs", git_commit="abc")
-    write_result(replace(finished.result, path=run.path(folder / "results")), finished.returns, finished.metrics)
-    result = run.result(folder / "results")
-    assert result is not None and result.seconds > 0 and result.git_commit == "abc" and result.started < result.finished
-    assert result.steps_per_second == pytest.approx(run.total_steps / result.seconds, rel=0.01)
+    run = replace(run, overrides=overrides)
+    with LocalBackend(1) as backend:
+        assert complete([run], folder / "results", folder / "logs", backend, silent(), retries=0) == []
+    result = find_result(run, folder / "results")
+    assert result is not None and result.seconds > 0 and result.started < result.finished
+    if sys.platform == "linux":
+        assert 1e8 < result.peak_memory < 1e10
     assert str(folder) not in (result.path / "run.json").read_text()
-    assert result.task_boundaries == [run.steps_per_task, 2 * run.steps_per_task]
+    assert json.loads((result.path / "run.json").read_text())["task_boundaries"] == [
+        run.steps_per_task,
+        2 * run.steps_per_task,
+    ]
     return result
+
+
+def silent():
+    return Console(file=open(os.devnull, "w"))
 
 
 def test_a_run_and_its_result(tmp_path):
@@ -349,18 +475,17 @@ def test_a_run_and_its_result(tmp_path):
     assert result.hyperparameters["max_grad_norm"] == "inf"
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
 @pytest.mark.parametrize(
-    "suite, env_id, method, names",
+    "suite, env_id, method, names, overrides",
     [
-        ("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"]),
-        ("dmc", "Continual/Walker-v0", "cchain", ["stand", "walk"]),
-        ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"]),
+        ("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"], ["n_epochs:1"]),
+        ("dmc", "Continual/Walker-v0", "cchain", ["stand", "walk"], ["n_epochs:1"]),
+        ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"], []),
     ],
 )
-def test_runs_of_the_other_suites(suite, env_id, method, names, tmp_path):
-    result = train_smoke(suite, env_id, method, tmp_path)
+def test_runs_of_the_other_suites(suite, env_id, method, names, overrides, tmp_path):
+    result = train_smoke(suite, env_id, method, tmp_path, *overrides)
     assert result.task_names == names
     rows = result.returns
     if suite == "minatar":
@@ -368,79 +493,113 @@ def test_runs_of_the_other_suites(suite, env_id, method, names, tmp_path):
     assert {row["task_id"] for row in rows} <= {0, 1} and rows
 
 
+def wait_for(condition, what, seconds=300):  # Ray gives its workers the lowest priority
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, f"no {what} in {seconds} seconds"
+        time.sleep(0.05)
+    return value
+
+
 def test_a_failed_run_says_why(tmp_path):
-    bad = replace(GRID_RUN, env_id="Continual/Acrobat-v1")
-    with pytest.raises(RunFailed) as error:
-        train(bad, tmp_path)
+    """Of the real command."""
+    bad = replace(RUN, env_id="Continual/Acrobat-v1")
+    training = Training(bad, tmp_path)
+    wait_for(lambda: not training.is_running(), "end")
+    with pytest.raises(TrainingFailed) as error:
+        training.finish()
     reason, log, _ = error.value.args
     assert "\n" not in reason and "Acrobot-v1" in reason
-    assert Path(log).is_relative_to(bad.path(tmp_path)) and reason in Path(log).read_text()
+    assert Path(log).is_relative_to(bad.path_in(tmp_path)) and reason in Path(log).read_text()
 
 
-class FakeRay:
+# --- Execution, by both backends: the training command is another, which starts at once ----------------------------------
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two nodes of one core each on this machine."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster.add_node(num_cpus=1)
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def ray_backend(cluster):
+    with pytest.raises(ValueError, match="--gpus-per-run must be at most the GPUs that Ray finds, 0; got"):
+        RayBackend(cluster.address, 0.25)
+    with RayBackend(cluster.address) as backend:
+        yield backend
+
+
+@pytest.fixture(params=["local", "ray"])
+def backend(request):
+    if request.param == "ray":
+        yield request.getfixturevalue("ray_backend")
+    else:
+        with LocalBackend(2) as backend:
+            yield backend
+
+
+def seeds_of_results(folder):
+    return sorted(result.seed for result in read_results(folder)[0])
+
+
+def attempts(run, logs):
+    return {path.name for path in run.path_in(logs).glob("attempt_*")}
+
+
+def test_every_run_comes_to_its_end_or_fails_thrice(tmp_path, backend, monkeypatch):
     """
-    Runs a task as soon as it is waited for.
-
-    :param outcomes: What becomes of the tasks of a seed, one after the other: a result, or an error
+    Of five seeds, the first is done at once, the second at the third attempt, the third never; another process finishes the
+    fourth, which waits meanwhile; the fifth was done before.
     """
+    results, logs = tmp_path / "results", tmp_path / "logs"
+    runs = [replace(RUN, seed=seed) for seed in range(5)]
+    made = [make_result(results, run) for run in runs]
+    write_result(made[4], ROWS, [])
+    monkeypatch.setattr(backend, "program", fake_program(tmp_path / "fake", {1: ["fail", "fail", "ok"], 2: ["fail"]}))
+    start = backend.start
 
-    class exceptions:
-        class RayError(Exception):
-            pass
+    def start_and_finish_another(run, logs):
+        write_result(made[3], ROWS, [])
+        start(run, logs)
 
-    def __init__(self, outcomes):
-        self.outcomes, self.calls = outcomes, []
-
-    def cluster_resources(self):
-        return {"CPU": 2.0, "GPU": 1.0}
-
-    def remote(self, function):
-        return self
-
-    def options(self, **options):
-        assert options == dict(num_cpus=1, num_gpus=0.25, max_retries=0, scheduling_strategy="SPREAD")
-        remote = lambda *arguments: self.calls.append(arguments) or len(self.calls) - 1  # noqa: E731
-        return type("Task", (), {"remote": staticmethod(remote)})
-
-    def wait(self, references, num_returns, timeout):
-        return references[:1], references[1:]
-
-    def get(self, reference):
-        outcome = self.outcomes[self.calls[reference][0].seed].pop(0)()
-        if isinstance(outcome, Exception):
-            raise outcome
-        return outcome
-
-
-def test_which_runs_are_begun(tmp_path):
-    """
-    Of four seeds, the first comes to its end at the third attempt, the second never; another process finishes the third, which
-    waits meanwhile; the fourth was done before.
-    """
-    grid = [replace(GRID_RUN, seed=seed) for seed in range(4)]
-    made = [make_result(tmp_path, run) for run in grid]
-    write_result(made[3], ROWS, [])
-
-    def error():
-        return FakeRay.exceptions.RayError("line 1\n\nline 2")
-
-    def finish():
-        write_result(made[2], ROWS, [])
-        return made[0], ROWS, []
-
-    ray = FakeRay({0: [error, error, finish], 1: [error] * 3})
+    monkeypatch.setattr(backend, "start", start_and_finish_another)
     output = Console(record=True, file=open(os.devnull, "w"), width=300)
-    failures = complete_grid(ray, grid, tmp_path, tmp_path / "logs", 0.25, output)
-    assert read_results(tmp_path) == [made[0], made[2], made[3]]
-    assert [(failure.run.seed, failure.reason) for failure in failures] == [(1, "RayError: line 1 line 2")]
-    assert sorted(arguments[0].seed for arguments in ray.calls) == [0, 0, 0, 1, 1, 1]
-    assert {arguments[2] for arguments in ray.calls} == {"cuda"}
+    failures = complete(runs, results, logs, backend, output)
+    assert seeds_of_results(results) == [0, 1, 3, 4]
+    assert [len(attempts(run, logs)) for run in runs] == [1, 3, 1 + RETRIES, 0, 0]
+    (failure,) = failures
+    assert failure.run == runs[2] and failure.reason == "ValueError: boom"
+    assert Path(failure.log).read_text().startswith("sb3-cchain train --algo ppo_cchain")
     shown = output.export_text()
-    assert shown.count("seed 0 failed: RayError: line 1 line 2; see") == shown.count("seed 0 failed") == 2
-    assert shown.count("seed 1 failed") == 3 and shown.count("(tried again)") == 4
+    assert shown.count("seed 1 failed: ValueError: boom; see") == shown.count("seed 1 failed") == 2
+    assert shown.count("seed 2 failed") == 3 and shown.count("(tried again)") == 4
+    assert shown.count("seed 0 done") == shown.count("seed 1 done") == 1 and "seed 3 done" not in shown
+    result = find_result(runs[0], results)
+    assert [row["mean_return"] for row in result.returns] == [-10.0, -20.0] and result.versions["torch"] != "0"
+    # Again, nothing is left but the one that failed
+    assert len(complete(runs, results, logs, backend, silent(), retries=0)) == 1
+    assert [len(attempts(run, logs)) for run in runs] == [1, 3, 2 + RETRIES, 0, 0]
 
 
-# --- With Ray -----------------------------------------------------------------------------------------------------------
+def test_the_progress_of_local_runs_is_shown(tmp_path):
+    with LocalBackend(1, program=fake_program(tmp_path / "fake", {0: ["hang"]})) as backend:
+        backend.start(RUN, tmp_path)
+        shown = wait_for(lambda: [text for text in backend.progress().values() if text], "progress", 30)
+    assert shown == ["50%, task 0, return -10"]
+
+
+def test_a_run_that_cannot_be_started_has_failed(tmp_path):
+    (tmp_path / "file").touch()
+    with LocalBackend(1) as backend:
+        (failure,) = complete([RUN], tmp_path / "results", tmp_path / "file", backend, silent(), retries=1)
+    assert "Not a directory" in failure.reason
 
 
 def trainings(folder):
@@ -448,105 +607,91 @@ def trainings(folder):
     found = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            if "benchmarks.child\0" in (command := (process / "cmdline").read_text()) and str(folder) in command:
-                found[int(process.name)] = parent_of(int(process.name))
+            command = (process / "cmdline").read_text()
+            if "fake_training.py\0" in command and f"{folder}/" in command:
+                found[int(process.name)] = parent_process(int(process.name))
         except OSError:
             pass  # it has ended
     return found
 
 
-def parent_of(pid):
+def parent_process(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
-
-
-def wait_for(condition, what, seconds=900):  # Ray gives its workers the lowest priority
-    end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, f"no {what} in {seconds} seconds"
-        time.sleep(0.1)
-    return value
-
-
-def attempts(run, logs):
-    return {path.name for path in run.path(logs).glob("attempt_*")}
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
+DRIVER = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from benchmarks.grid.executor import LocalBackend, complete
+from benchmarks.grid.ray_backend import RayBackend
+from tests.test_grid import RUN
+
+address, results, logs, *program = sys.argv[1:]
+with LocalBackend(2, program=program) if address == "local" else RayBackend(address, program=program) as backend:
+    complete([replace(RUN, seed=seed) for seed in range(4)], Path(results), Path(logs), backend)
+"""
+
 
 @linux
-@pytest.mark.slow
-def test_a_killed_grid_goes_on(tmp_path):
-    pytest.importorskip("ray")
+@pytest.mark.parametrize(
+    "backend, ending", [("local", "SIGKILL"), ("local", "SIGINT"), ("ray", "SIGKILL")], indirect=["backend"]
+)
+def test_what_is_killed_goes_on(tmp_path, backend, ending, request):
+    """One run is done, two are running; first one of those is killed, then the whole command."""
     results, logs = tmp_path / "results", tmp_path / "logs"
-    command = [sys.executable, "-m", "benchmarks.run", "--suite", "gym_control", "--env", "Continual/CartPole-v1"]
-    command += ["--method", "vanilla", "--seeds", "4", "--budget", "smoke", "--cpus", "2"]
-    command += ["--results", str(results), "--logs", str(logs)]
-    grid = grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 4, "smoke")
-    with open(tmp_path / "first.txt", "w") as output:
+    runs = [replace(RUN, seed=seed) for seed in range(4)]
+    address = "local" if isinstance(backend, LocalBackend) else request.getfixturevalue("cluster").address
+    program = fake_program(tmp_path / "fake", {1: ["hang"], 2: ["hang"]})
+    command = [sys.executable, "-c", DRIVER, address, str(results), str(logs), *program]
+    with open(tmp_path / "output.txt", "w") as output:
         driver = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
     try:
-        training, worker = next(iter(wait_for(lambda: trainings(logs), "training").items()))
-        os.kill(worker, signal.SIGKILL)
-        wait_for(lambda: training not in trainings(logs), "end of the orphan", 30)
-        wait_for(lambda: read_results(results), "result")
+        first = wait_for(lambda: seeds_of_results(results) == [0] and len(found := trainings(logs)) == 2 and found, "training")
+        training, worker = next(iter(first.items()))
+        os.kill(training if address == "local" else worker, signal.SIGKILL)
+        wait_for(lambda: training not in trainings(logs), "end of the killed run", 30)
+        wait_for(lambda: len(trainings(logs)) == 2, "next attempt")
+        driver.send_signal(getattr(signal, ending))
+        assert driver.wait(60) != 0
     finally:
         driver.kill()
         driver.wait()
-    wait_for(lambda: not trainings(logs), "end of the killed grid", 60)
-    before = {run: (run.path(results) / "run.json").stat().st_mtime_ns for run in grid if run.result(results)}
-    tried = {run: attempts(run, logs) for run in grid}
-    assert 1 <= len(before) < 4
+    wait_for(lambda: not trainings(logs), "end of the killed command", 60)
+    assert "failed" in (tmp_path / "output.txt").read_text()
+    written = (runs[0].path_in(results) / "run.json").stat().st_mtime_ns
+    before = [attempts(run, logs) for run in runs]
+    assert [len(names) for names in before] in ([1, 2, 1, 0], [1, 1, 2, 0])
 
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert "4 of 4 runs are done, 0 failed" in again.stdout
-    assert sorted(result.seed for result in read_results(results)) == [0, 1, 2, 3]
-    for run in grid:
-        assert len(read_result(run.path(results)).returns) == 2
-        if run in before:  # not again
-            assert (run.path(results) / "run.json").stat().st_mtime_ns == before[run]
-            assert attempts(run, logs) == tried[run]
-        else:
-            assert len(attempts(run, logs) - tried[run]) == 1
-    # The run whose worker was killed
-    assert sum(len(attempts(run, logs)) for run in grid) >= 4 + 1
+    backend.program = fake_program(tmp_path / "fake", {})
+    assert complete(runs, results, logs, backend, silent()) == []
+    assert seeds_of_results(results) == [0, 1, 2, 3]
+    assert (runs[0].path_in(results) / "run.json").stat().st_mtime_ns == written
+    assert [len(attempts(run, logs) - names) for run, names in zip(runs, before, strict=True)] == [0, 1, 1, 1]
 
 
 @linux
-@pytest.mark.slow
-def test_a_cluster_of_two_nodes_loses_one(tmp_path):
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
+def test_a_cluster_of_two_nodes_loses_one(tmp_path, cluster, ray_backend):
     results, logs = tmp_path / "results", tmp_path / "logs"
-    grid = grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], 3, "smoke")
-    bad = replace(GRID_RUN, env_id="Continual/Acrobat-v1")
-    ray = import_ray()
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    runs = [replace(RUN, seed=seed) for seed in range(4)]
+    ray_backend.program = fake_program(tmp_path / "fake", {0: ["wait"], 1: ["wait"], 3: ["fail"]})
     raylets = set()
 
     def lose_one():
         # A node has a core, so two trainings at a time are on two nodes
         two = wait_for(lambda: len(found := trainings(logs)) == 2 and found, "two trainings at once")
-        raylets.update(parent_of(worker) for worker in two.values())
-        cluster.remove_node(node, allow_graceful=False)
+        raylets.update(parent_process(worker) for worker in two.values())
+        cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
+        (tmp_path / "fake" / "go").touch()
 
-    try:
-        node = cluster.add_node(num_cpus=1)
-        with pytest.raises(ValueError, match="--gpus-per-run must be at most the GPUs that Ray finds, 0; got"):
-            connect(ray, cluster.address, None, 0.25)
-        connect(ray, cluster.address, None, 0.0)
-        accident = threading.Thread(target=lose_one)
-        accident.start()
-        failures = complete_grid(ray, [*grid, bad], results, logs, console=Console(file=open(os.devnull, "w")))
-        accident.join()
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
+    accident = threading.Thread(target=lose_one)
+    accident.start()
+    (failure,) = complete(runs, results, logs, ray_backend, silent())
+    accident.join()
     assert len(raylets) == 2
-    assert [result.seed for result in read_results(results)] == [0, 1, 2]
-    assert sum(len(attempts(run, logs)) for run in grid) == 3 + 1
-    (failure,) = failures
-    assert failure.run == bad and "Acrobot-v1" in failure.reason and Path(failure.log).exists()
-    assert len(attempts(bad, logs)) == 1 + RETRIES
+    assert seeds_of_results(results) == [0, 1, 2]
+    n_attempts = Counter({run.seed: len(attempts(run, logs)) for run in runs})
+    assert n_attempts[0] + n_attempts[1] == 2 + 1 and n_attempts[2] == 1 and n_attempts[3] == 1 + RETRIES
+    assert failure.run == runs[3] and failure.reason == "ValueError: boom" and Path(failure.log).exists()
