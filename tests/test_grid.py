@@ -22,7 +22,6 @@ from benchmarks.grid.ray_backend import RayBackend, count_slots
 from benchmarks.grid.results import RENAMED, Result, find_result, read_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run, as_json, make_run, paper_methods, suite_methods
 from benchmarks.grid.suites import SUITES, task_names
-from benchmarks.grid.training import Training, TrainingFailed
 from benchmarks.grid.view import Failure, View, duration
 from benchmarks.run import main
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
@@ -441,30 +440,35 @@ def test_places_on_gpus_by_hand():
 # --- Training -----------------------------------------------------------------------------------------------------------
 
 
-def train_smoke(suite, env_id, method, folder, *overrides):
-    """Of overrides, those that make it shorter."""
-    (run,) = grid_runs([suite], [env_id], [method], budget="smoke")
-    run = replace(run, overrides=overrides)
-    with LocalBackend(1) as backend:
-        assert complete([run], folder / "results", folder / "logs", backend, silent(), retries=0) == []
-    result = find_result(run, folder / "results")
-    assert result is not None and result.seconds > 0 and result.started < result.finished
-    if sys.platform == "linux":
-        assert 1e8 < result.peak_memory < 1e10
-    assert str(folder) not in (result.path / "run.json").read_text()
-    assert json.loads((result.path / "run.json").read_text())["task_boundaries"] == [
-        run.steps_per_task,
-        2 * run.steps_per_task,
-    ]
-    return result
-
-
 def silent():
     return Console(file=open(os.devnull, "w"))
 
 
-def test_a_run_and_its_result(tmp_path):
-    result = train_smoke("gym_control", "Continual/CartPole-v1", "cchain", tmp_path)
+def train(runs, folder):
+    """With the real command, at the same time. Returns the failures too."""
+    with LocalBackend(2) as backend:
+        failures = complete(runs, folder / "results", folder / "logs", backend, silent(), retries=0)
+    results, left_out = read_results(folder / "results")
+    assert left_out == {}
+    for result in results:
+        assert result.seconds > 0 and result.started < result.finished
+        if sys.platform == "linux":
+            assert 1e8 < result.peak_memory < 1e10
+        text = (result.path / "run.json").read_text()
+        assert str(folder) not in text
+        assert json.loads(text)["task_boundaries"] == [result.steps_per_task, 2 * result.steps_per_task]
+    return results, failures
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run, and one that fails."""
+    return train([RUN, replace(RUN, env_id="Continual/Acrobat-v1")], tmp_path_factory.mktemp("trained"))
+
+
+def test_a_run_and_its_result(trained):
+    (result,), _ = trained
+    assert result.settings == RUN.settings
     assert [(row["timesteps"], row["task_id"]) for row in result.returns] == [(800, 0), (1600, 1)]
     metrics = result.metrics
     assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith("churn/") for name in metrics)
@@ -473,6 +477,13 @@ def test_a_run_and_its_result(tmp_path):
     assert result.command[:4] == ["sb3-cchain", "train", "--algo", "ppo_cchain"]
     assert "logs/grid/smoke/gym_control/Continual-CartPole-v1/cchain/seed_0" in result.command
     assert result.hyperparameters["max_grad_norm"] == "inf"
+
+
+def test_a_failed_run_says_why(trained):
+    _, (failure,) = trained
+    assert "\n" not in failure.reason and "Acrobot-v1" in failure.reason
+    assert failure.run.env_id == "Continual/Acrobat-v1" and failure.reason in Path(failure.log).read_text()
+    assert "/smoke/gym_control/Continual-Acrobat-v1/cchain/seed_0/attempt_" in failure.log
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
@@ -485,7 +496,9 @@ def test_a_run_and_its_result(tmp_path):
     ],
 )
 def test_runs_of_the_other_suites(suite, env_id, method, names, overrides, tmp_path):
-    result = train_smoke(suite, env_id, method, tmp_path, *overrides)
+    (run,) = grid_runs([suite], [env_id], [method], budget="smoke")
+    (result,), failures = train([replace(run, overrides=tuple(overrides))], tmp_path)
+    assert failures == [] and find_result(replace(run, overrides=tuple(overrides)), tmp_path / "results") == result
     assert result.task_names == names
     rows = result.returns
     if suite == "minatar":
@@ -499,18 +512,6 @@ def wait_for(condition, what, seconds=300):  # Ray gives its workers the lowest 
         assert time.monotonic() < end, f"no {what} in {seconds} seconds"
         time.sleep(0.05)
     return value
-
-
-def test_a_failed_run_says_why(tmp_path):
-    """Of the real command."""
-    bad = replace(RUN, env_id="Continual/Acrobat-v1")
-    training = Training(bad, tmp_path)
-    wait_for(lambda: not training.is_running(), "end")
-    with pytest.raises(TrainingFailed) as error:
-        training.finish()
-    reason, log, _ = error.value.args
-    assert "\n" not in reason and "Acrobot-v1" in reason
-    assert Path(log).is_relative_to(bad.path_in(tmp_path)) and reason in Path(log).read_text()
 
 
 # --- Execution, by both backends: the training command is another, which starts at once ----------------------------------
@@ -623,15 +624,15 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
 DRIVER = """
 import sys
-from dataclasses import replace
 from pathlib import Path
 from benchmarks.grid.executor import LocalBackend, complete
 from benchmarks.grid.ray_backend import RayBackend
-from tests.test_grid import RUN
+from benchmarks.grid.run import Run
 
 address, results, logs, *program = sys.argv[1:]
 with LocalBackend(2, program=program) if address == "local" else RayBackend(address, program=program) as backend:
-    complete([replace(RUN, seed=seed) for seed in range(4)], Path(results), Path(logs), backend)
+    runs = [Run("gym_control", "Continual/CartPole-v1", "cchain", seed, 2, 800, "smoke") for seed in range(4)]
+    complete(runs, Path(results), Path(logs), backend)
 """
 
 
