@@ -75,6 +75,7 @@ def test_defaults_are_the_papers(name):
     domain, tasks, n_observations, n_actions = SEQUENCES[name]
     env = gym.make(f"Continual/{name}-v0").unwrapped
     assert (env.domain, env.task_names) == (domain, tasks)
+    assert env.task_sequence == [(domain, task) for task in tasks]
     assert [task.spec.id for task in env.tasks] == [f"dm_control/{domain}-{task}-v0" for task in tasks]
     assert env.steps_per_task == [1_000_000] * len(tasks)
     assert env.observation_space == spaces.Box(-np.inf, np.inf, (n_observations,), np.float32)

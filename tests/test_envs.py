@@ -417,7 +417,7 @@ class ResetByHand(BaseCallback):
 
 def test_a_reset_by_hand_keeps_tasks_and_metrics():
     record, env = RecordTasks(), TaskVecNormalize(make_vec_env(three_tasks, env_kwargs=dict(steps_per_task=48)))
-    model = CChainPPO("MlpPolicy", env, **SETTINGS).learn(80, callback=[record, ResetByHand()])
+    model = CChainPPO("MlpPolicy", env, **SETTINGS).learn(80, [record, ResetByHand()], log_interval=None)
     assert [record.tasks[step] for step in (1, 20, 21, 48, 49, 80)] == [[0]] * 4 + [[1]] * 2
     assert env.obs_rms.count == pytest.approx(33, abs=1e-3)
     # One reward a step, whatever episodes it falls in

@@ -313,6 +313,7 @@ def test_switches_in_time_with_procgens_own_episodes():
 def test_levels_per_task():
     env = ContinualProcgen("maze", n_tasks=2, first_level=3, num_levels=4)
     assert env.levels == [range(3, 7), range(7, 11)]
+    assert env.task_sequence == [("maze", 3, 4), ("maze", 7, 4)]
     for task_id in range(2):
         env.set_task(task_id)
         found = set()

@@ -7,13 +7,13 @@ from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedA
 
 class EpisodicRollouts(RolloutNormalizedAdvantage):
     """
-    Makes SB3's on-policy algorithms learn from rollouts as the PPO does that the paper's Gym Control experiments are made
-    with (TRAC's code base):
+    Makes SB3's on-policy algorithms learn from rollouts like the PPO of the paper's Gym Control experiments (TRAC's code
+    base):
 
-    - each rollout begins with a new episode; the one that was under way is dropped;
-    - advantages are normalised once over the whole rollout, where SB3's PPO does so for each minibatch. Use it with
+    - each rollout begins with a new episode; the episode that was under way is dropped;
+    - advantages are normalised once over the whole rollout, while SB3's PPO normalises them for each minibatch. Use it with
       ``normalize_advantage=False``;
-    - the value function is fitted to the discounted return-to-go, where SB3 fits it to the TD(λ) return. The value of the
+    - the value function is fitted to the discounted return-to-go, while SB3 fits it to the TD(λ) return. The value of the
       last observation stands for the rest of an episode that was cut.
     """
 

@@ -6,8 +6,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 class RolloutNormalizedAdvantage(BaseCallback):
     """
-    Normalises the advantages once over the whole rollout, to mean 0 and standard deviation 1, where SB3's PPO does so for each
-    minibatch. Use it with ``normalize_advantage=False``.
+    Normalises the advantages once over the whole rollout, to mean 0 and standard deviation 1. SB3's PPO normalises them for
+    each minibatch. Use it with ``normalize_advantage=False``.
     """
 
     model: OnPolicyAlgorithm

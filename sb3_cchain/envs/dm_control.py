@@ -15,12 +15,12 @@ from sb3_cchain.validation import check_list
 
 class FlatDMControl(gym.Wrapper):
     """
-    Makes an environment of dm_control, as Shimmy wraps it, fit for Stable-Baselines3.
+    Makes an environment of dm_control, as Shimmy wraps it, suitable for Stable-Baselines3.
 
     - Observations are flattened, in the order of :class:`gymnasium.wrappers.FlattenObservation`: their parts by name. They
-      are ``float32``, with which buffers take half the memory; dm_control's ``float64`` is more than the networks see.
-    - Actions are clipped to dm_control's bounds. The action space keeps the bounds (that of Gymnasium's ``ClipAction`` has
-      none, which Stable-Baselines3 refuses), as ``float32``.
+      are ``float32``, which halves the memory of buffers; the networks would not use the precision of ``float64``.
+    - Actions are clipped to dm_control's bounds. The action space keeps the bounds, as ``float32``. (The action space of
+      Gymnasium's ``ClipAction`` has no bounds, which Stable-Baselines3 refuses.)
 
     :param env: The environment
     :raises TypeError: When its observations are not a ``Dict`` or its actions not a ``Box``
@@ -59,7 +59,7 @@ class FlatDMControl(gym.Wrapper):
 
     def step(self, action: NDArray[np.floating]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
         """
-        :param action: The action; what is out of bounds is clipped
+        :param action: The action; values out of bounds are clipped
         :return: Observation, reward, terminated, truncated, info
         """
         clipped = np.clip(action, self._low, self._high)
@@ -81,7 +81,7 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating]]
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: As in :func:`gymnasium.make`
-    :raises TypeError: When ``tasks`` is a string, or no list
+    :raises TypeError: When ``tasks`` is a string or not a list
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When dm_control or Shimmy is not installed
     """

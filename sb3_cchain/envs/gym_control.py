@@ -57,14 +57,14 @@ class ContinualGymControl(ContinualEnv):
     with a fixed offset added to every observation, drawn once per task from N(0, σ²) for each dimension. The first task's
     offset is zero, as in the released code.
 
-    The environment's own limit of episode steps is lifted. ``gymnasium.make("Continual/...")`` sets one of 400 steps, as in
-    the released code, and takes another as ``max_episode_steps``.
+    The environment's own limit of episode steps is lifted. ``gymnasium.make("Continual/...")`` sets a limit of 400 steps, as
+    in the released code; ``max_episode_steps`` sets another.
 
     :param env_id: The environment, with ``Box`` observations
     :param n_tasks: Length of the sequence
     :param steps_per_task: Environment steps per task, one number for all or one per task
     :param offset_std: σ
-    :param offset_seed: Seed of the offsets, which depend on nothing else: not on ``reset(seed=...)``
+    :param offset_seed: Seed of the offsets. They do not depend on ``reset(seed=...)``
     :param offsets: The offsets themselves, ``(n_tasks, *observation_shape)``; read back as the attribute ``offsets``
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`

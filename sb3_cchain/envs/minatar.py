@@ -90,9 +90,9 @@ class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     """
     Makes ``reset(seed=...)`` of a MinAtar game determine all that follows.
 
-    With sticky actions MinAtar now and then repeats the action before, at the first step of an episode that of the episode
-    before. A seeded reset forgets it (the first action may be replaced by "no operation"); one without a seed keeps it, as
-    MinAtar does. It is all that a game carries over a reset besides its random numbers, which the seed determines.
+    With sticky actions MinAtar now and then repeats the last action, even if that action belongs to the episode before. A
+    seeded reset forgets the last action (the first action may then be replaced by "no operation"); a reset without a seed
+    keeps it, as MinAtar does. Besides its random numbers, which the seed determines, a game carries nothing else over a reset.
 
     :param env: A MinAtar environment
     """
@@ -110,8 +110,8 @@ class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
 
 class PixelFrames(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     """
-    Makes the ``rgb_array`` frames of a MinAtar game fit for a video recorder: integers from 0 to 255 instead of floats from 0
-    to 1, and enlarged from 10 × 10 pixels.
+    Makes the ``rgb_array`` frames of a MinAtar game suitable for a video recorder: integers from 0 to 255 instead of floats
+    from 0 to 1, and enlarged from 10 × 10 pixels.
 
     :param env: A MinAtar environment
     :param scale: Pixels per cell and direction. With 16 the frame is one that video encoders need not resize.
@@ -141,7 +141,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
 
     All games have the same six actions, and observations of 10 × 10 cells padded to the same number of boolean channels.
     An episode of Seaquest is truncated after 1000 steps in a row without reward: at the surface it would never end. The
-    released code does so after the first 1000 steps only, which leaves the submarine that surfaces for good later.
+    released code does so only after the first 1000 steps, which leaves a submarine that surfaces for good later.
 
     :param games: The games in order, from Asterix, Breakout, Freeway, Seaquest and SpaceInvaders; a game may come again
     :param steps_per_task: Environment steps per task, one number for all or one per task
@@ -197,8 +197,8 @@ def _make_game(game: str, n_channels: int, **kwargs: Any) -> gym.Env:
     env_id = f"MinAtar/{game}-v0"
     if env_id not in gym.registry:
         minatar.gym.register_envs()
-    # By its specification, as Gymnasium calls the id out of date: "-v1" has the actions that matter in the game alone.
-    # Gymnasium's checker would warn of the frames that PixelFrames mends.
+    # By its specification, because Gymnasium warns that the id is out of date: "-v1" has only the actions that matter in the
+    # game. Gymnasium's checker would warn of the frames that PixelFrames mends.
     env = gym.make(gym.spec(env_id), disable_env_checker=True, **kwargs)
     # SpaceInvaders' rewards are NumPy's integers, which Stable-Baselines3's checker refuses
     env = TransformReward(PixelFrames(SeededStickyAction(env)), float)

@@ -55,26 +55,26 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
     """
     One game of procgen.
 
-    Procgen begins the next episode by itself, within the step that ends one, and never shows how that one ended. So the
-    observation at an episode's end is the one before its last step: there is no later one of that episode. What procgen gives
-    is the next episode's first, perhaps of another level. No value is taken of either, as the episode is over.
+    Procgen begins the next episode by itself, within the step that ends one, and never shows how that episode ended. The
+    observation at an episode's end is therefore the one before its last step, the last one there is. What procgen gives
+    is the next episode's first, perhaps of another level. The agent uses the value of neither, because the episode is over.
 
-    The ``reset()`` that follows returns the first observation of the episode that has already begun. One in the middle of an
-    episode makes procgen begin another, as it does itself, after a step without movement that is not seen.
+    The ``reset()`` that follows returns the first observation of the episode that has already begun. A reset in the middle of
+    an episode makes procgen begin another one, after a step without movement that is not seen.
 
     Procgen has time limits of its own (1000 steps unless a game sets another) and does not say that one was reached: every end
     is ``terminated``, as in procgen's own interface.
 
     A reset with a seed determines which levels come next. Nothing else is left to chance: the same actions in the same level
-    make the same episode. With ``num_levels=1``, therefore, all episodes begin alike and the seed has no effect. (There is one
+    make the same episode. With ``num_levels=1``, all episodes begin alike and the seed has no effect. (There is one
     exception: after a reset without a seed Dodgeball's player faces where it last went in the episode before.)
 
     Frames (``render_mode="rgb_array"``) are the observations, enlarged. Procgen draws finer ones, but at every step, which is
-    then tens of times slower, and Stable-Baselines3 asks every environment that it makes for frames.
+    tens of times slower, and Stable-Baselines3 asks every environment that it makes for frames.
 
     :param game: The game, by procgen's name for it
     :param start_level: The first of its levels
-    :param num_levels: From how many levels, beginning with that, each episode's is drawn; 0 is all there are
+    :param num_levels: From how many levels, beginning with ``start_level``, the level of each episode is drawn; 0 means all
     :param distribution_mode: ``"easy"`` or ``"hard"``; some games have ``"extreme"`` or ``"memory"``
     :param render_mode: ``"rgb_array"`` or ``None``
     :raises ValueError: Naming the argument that is out of its range
@@ -110,9 +110,9 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         }
         # Begun at the first reset, so that tasks far ahead cost nothing
         self._game: ProcgenGym3Env | None = None
-        # Of the episode that procgen has begun and reset() has not
+        # The first observation of an episode that procgen has begun and reset() has not
         self._next_observation: NDArray[np.uint8] | None = None
-        # The last that was given away
+        # The last observation that was returned
         self._observation: NDArray[np.uint8] | None = None
 
     def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> "ProcgenGym3Env":
@@ -128,9 +128,10 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         """
-        Begin an episode; after the end of one, that which procgen has begun.
+        Begin an episode. After the end of one, it is the episode that procgen has begun already.
 
-        :param seed: Determines the levels of this and all later episodes. Procgen is launched anew, as it takes no seed later.
+        :param seed: Determines the levels of this and all later episodes. Procgen is launched
+            again, because it takes a seed only then.
         :param options: Not used
         :return: Observation and info
         """
@@ -196,7 +197,7 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
     :param n_tasks: Length of the sequence
     :param steps_per_task: Environment steps per task, one number for all or one per task
     :param first_level: The first level of the first task; read back, with all others, as the attribute ``levels``
-    :param num_levels: Levels per task, from which each episode's is drawn
+    :param num_levels: Levels per task, from which the level of each episode is drawn
     :param distribution_mode: See :class:`~sb3_cchain.envs.ProcgenGame`
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`

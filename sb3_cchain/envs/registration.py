@@ -1,9 +1,9 @@
-"""The table of registered environments."""
+"""The table of registered environments. A new suite needs a file of its own and an entry here."""
 
 import gymnasium as gym
 
-# Keyword arguments of `gymnasium.register` by the id without its namespace. In `kwargs` stands what differs from the
-# defaults of the entry point; all of it can be given to `gymnasium.make`.
+# Keyword arguments of `gymnasium.register` by the id without its namespace. `kwargs` holds only arguments that differ from
+# the defaults of the entry point; each of them can be given to `gymnasium.make`, too.
 _GYM_CONTROL = {"entry_point": "sb3_cchain.envs.gym_control:ContinualGymControl", "max_episode_steps": 400}
 _DM_CONTROL = "sb3_cchain.envs.dm_control:ContinualDMControl"
 _PROCGEN = "sb3_cchain.envs.procgen:ContinualProcgen"

@@ -1,4 +1,4 @@
-"""Normalisation that begins anew with each task."""
+"""Normalisation whose statistics restart at each task."""
 
 from copy import deepcopy
 from typing import Any
@@ -19,18 +19,18 @@ class TaskVecNormalize(VecNormalize):
     """
     Stable-Baselines3's ``VecNormalize``, whose statistics restart when the task of a continual environment changes.
 
-    Nothing is carried over a switch: neither the mean and variance of the observations nor the variance of the returns nor
-    the discounted returns so far. What belongs to the task before is normalised with its statistics: the last step's reward
-    and the ``terminal_observation`` in its info. The observation that comes with that step is already the next task's
-    first, and the first in the new statistics.
+    Nothing is carried over a switch: not the mean and variance of the observations, not the variance of the returns, not
+    the discounted returns so far. The last step's reward and the ``terminal_observation`` in its info belong to the old task
+    and are normalised with its statistics. The observation that comes with that step is already the first of the next task,
+    and the first in the new statistics.
 
-    It reads the task from ``task_id`` in the infos, that of the first environment for all; they switch together. Where there
-    is none, where the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With ``training=False``
-    statistics are neither updated nor restarted, so that an evaluation environment has those of training
-    (``EvalCallback`` copies them).
+    It reads the task from ``task_id`` in the infos of the first environment; environments side by side switch together.
+    Without a ``task_id``, while the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With
+    ``training=False`` statistics are neither updated nor restarted, so that an evaluation environment has the statistics of
+    training (``EvalCallback`` copies them).
 
-    Saved statistics belong to a task. When training is resumed with them they go on if the environment is put on that task
-    (``CChainPPO`` and :class:`~sb3_cchain.TaskSync` do so) and restart if it is not.
+    Saved statistics belong to a task. When training is resumed with them, they go on if the environment is put on that task
+    (``CChainPPO`` and :class:`~sb3_cchain.TaskSync` do so) and restart otherwise.
 
     :param venv: The vectorised environment
     :param training: See ``VecNormalize``, as the following ones
@@ -75,8 +75,8 @@ class TaskVecNormalize(VecNormalize):
         :return: Normalised observation
         """
         if self._follows_tasks():
-            # Training that is resumed begins with a reset into the first task and another into the task that is due. A
-            # reset that no step followed must leave nothing behind, or loaded statistics would be lost.
+            # Resumed training begins with a reset into the first task and another reset into the task that is due. A reset
+            # that is not followed by a step must leave nothing behind, or loaded statistics would be lost.
             if self._before_reset is not None:
                 self.__dict__.update(self._before_reset)
             # Without normalisation of observations there is no `obs_rms`
@@ -99,7 +99,8 @@ class TaskVecNormalize(VecNormalize):
         if self.training:
             self._update_reward(rewards)
         rewards = self.normalize_reward(rewards)
-        # At a switch the restart comes between what ends and what begins, hence not by VecNormalize's own method
+        # At a switch the statistics restart between the old task's values and the new task's, which VecNormalize's own
+        # method has no place for
         switch = self._enters_task()
         if switch:
             self._normalize_terminal(dones, infos)

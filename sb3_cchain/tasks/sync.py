@@ -33,9 +33,9 @@ class TaskSync(BaseCallback):
     Keeps continual environments in step with training.
 
     - The training environments switch tasks together, in total environment steps: they are told their number and how
-      many steps the model was trained for. So training that is resumed in a new environment goes on with the right task.
-    - The environments of every ``EvalCallback`` given to ``learn()`` are put on the task being trained. Left alone, they
-      would count their own few steps and stay on the first task.
+      many steps the model was trained for. Training that is resumed in a new environment goes on with the right task.
+    - The environments of every ``EvalCallback`` given to ``learn()`` are put on the task being trained. Otherwise they would
+      count their own few steps and stay on the first task.
 
     ``CChainPPO`` adds it by itself in a continual environment; give it to other algorithms, before any ``EvalCallback``.
 
