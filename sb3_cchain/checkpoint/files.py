@@ -76,15 +76,15 @@ def _fault(path: Path) -> str | None:
     """What is wrong with a saved model, if anything."""
     try:
         with zipfile.ZipFile(path) as archive:
-            torn = archive.testzip() is not None
-            names = archive.namelist()
+            names = archive.namelist() if archive.testzip() is None else []
     except (zipfile.BadZipFile, zlib.error, EOFError):
-        torn = True
-    if torn:
-        return "is torn or not a zip file: perhaps training was killed while it was written"
-    if "data" not in names:
-        return "holds no settings of a model (no entry `data`): save it by the model's save()"
-    return None
+        names = []
+    if "data" in names:
+        return None
+    # PyTorch's files in it are zip files, too, so that a torn file may pass for one of those
+    if "_stable_baselines3_version" in names:
+        return "holds parameters without the model's settings (no entry `data`): save it by the model's save()"
+    return "is torn or not a saved model: perhaps training was killed while it was written"
 
 
 def saved_timesteps(path: str | Path) -> int:

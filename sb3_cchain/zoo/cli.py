@@ -10,7 +10,9 @@ import warnings
 from typing import Any
 
 import rl_zoo3.train
+import rl_zoo3.utils
 import yaml
+from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -73,6 +75,8 @@ def call_our_command(command: list[str], *args: Any, **kwargs: Any) -> int:
     :param kwargs: Other arguments of ``subprocess.call``
     :return: Exit code
     """
+    # Names of environments are EnvironmentName, see `run_module`
+    command = [getattr(argument, "gym_id", argument) for argument in command]
     for stock, name in ((["python", "-m", "rl_zoo3.record_video"], "record_video"), (["python", "enjoy.py"], "enjoy")):
         if command[: len(stock)] == stock:
             command = [sys.executable, "-m", "sb3_cchain.zoo", name, *command[len(stock) :]]
@@ -129,7 +133,17 @@ def run_module(name: str) -> None:
     :param name: Its name, which ``sys.argv[1]`` is as well
     """
     del sys.argv[1]
-    with replaced(subprocess, "call", call_our_command), warnings.catch_warnings():
+    get_trained_models = rl_zoo3.utils.get_trained_models
+
+    def get_trained_models_by_name(log_folder: str) -> dict[str, tuple[str, str]]:
+        # benchmark uses the id in paths, where "Continual/..." would be two folders
+        return {key: (algo, EnvironmentName(env_id)) for key, (algo, env_id) in get_trained_models(log_folder).items()}
+
+    with (
+        replaced(subprocess, "call", call_our_command),
+        replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
+        warnings.catch_warnings(),
+    ):
         # enjoy has imported load_from_hub before
         warnings.filterwarnings("ignore", message=".*found in sys.modules", category=RuntimeWarning)
         runpy.run_module(f"rl_zoo3.{name}", run_name="__main__")

@@ -1,0 +1,283 @@
+"""The YAML files, and which of them the command line takes."""
+
+import ast
+import sys
+from collections import OrderedDict
+
+import pytest
+import rl_zoo3
+import torch as th
+import yaml
+from stable_baselines3 import DQN, PPO
+
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
+from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
+from tests.zoo_command import DMC, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, SUITES, command, shipped_settings
+
+# Algorithms of which RL Zoo has no settings
+NEW_ALGOS = ["ppo_cchain", "dqn_cchain", "double_dqn"]
+# The related methods that have a YAML file
+METHODS = [row.algo for row in REGISTRY if row.is_related and (hyperparams_folder() / f"{row.algo}.yml").is_file()]
+
+
+def train(folder, algo, env_id, n_steps, *arguments):
+    command(
+        *("train", "--algo", algo, "--env", env_id, "-n", n_steps, "-f", folder, *NO_EVALUATION, "--seed", "0", *FAST),
+        *arguments,
+    )
+
+
+def test_every_environment_has_settings():
+    continual = {f"Continual/{name}" for name in CONTINUAL_ENVS}
+    assert len(continual) == 24 and {*GYM_CONTROL, *PROCGEN, *DMC, "Continual/MinAtar-v0"} == continual
+    for algos, env_ids in (
+        (("ppo", "ppo_cchain"), {*GYM_CONTROL, *PROCGEN, *DMC}),
+        (("dqn", "double_dqn", "dqn_cchain"), {"Continual/MinAtar-v0"}),
+    ):
+        for algo in algos:
+            assert {key for key in shipped_settings(algo) if not key.endswith("default") and "defaults" not in key} == env_ids
+    for algo in NEW_ALGOS:
+        assert "default" in shipped_settings(algo)
+
+
+# Shorter than the settings', where a rollout of those takes long
+ROLLOUTS = {
+    **{(algo, env_id): [] for env_id in GYM_CONTROL for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:16", "batch_size:16", "n_epochs:1"] for env_id in PROCGEN for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:64", "n_epochs:1"] for env_id in DMC for algo in ("ppo", "ppo_cchain")},
+    **{(algo, "Continual/MinAtar-v0"): ["buffer_size:1000"] for algo in ("dqn", "double_dqn", "dqn_cchain")},
+}
+
+
+@pytest.mark.parametrize("algo, env_id", ROLLOUTS)
+@pytest.mark.filterwarnings("ignore")
+def test_every_environment_trains_a_rollout_with_its_settings(tmp_path, algo, env_id):
+    if sys.version_info >= (3, 13) and env_id in PROCGEN + DMC:
+        pytest.skip("no wheels")
+    changed = ROLLOUTS[algo, env_id]
+    n_steps = next((change.split(":")[1] for change in changed if "n_steps" in change), "800")
+    train(tmp_path, algo, env_id, n_steps, *(["-params", *changed] if changed else []))
+    (path,) = tmp_path.glob(f"{algo}/*/*-v?.zip")
+    algorithm = {"ppo": PPO, "dqn": DQN, "ppo_cchain": CChainPPO, "dqn_cchain": CChainDQN, "double_dqn": DoubleDQN}[algo]
+    model = algorithm.load(path, device="cpu")
+    settings = shipped_settings(algo)[env_id]
+    assert model.num_timesteps == int(n_steps) and model.gamma == settings["gamma"]
+    if "dqn" in algo:
+        assert model._n_updates == 0 and model.learning_starts == 10_000  # all of it random
+        return
+    assert model._n_updates == (1 if changed else settings["n_epochs"])
+    if algo == "ppo_cchain":
+        assert model.churn_reducer.coefficient.n_seen == 1
+        assert model.churn_reducer.coefficient.target_ratio == settings["target_churn_ratio"]
+
+
+def test_suites_differ_in_the_churn_arguments_alone():
+    ppo, cchain = (shipped_settings(algo) for algo in ("ppo", "ppo_cchain"))
+    for env_id in PROCGEN + DMC:
+        churn = {key: value for key, value in cchain[env_id].items() if "churn" in key}
+        assert cchain[env_id] == {**ppo[env_id], **churn}
+    for env_id in DMC:
+        assert cchain[env_id]["target_churn_ratio"] == (0.5 if "Walker" in env_id else 0.05)
+        assert ppo[env_id]["n_timesteps"] == (4e6 if "Dog" in env_id else 3e6)
+    for env_id in PROCGEN:
+        assert cchain[env_id] == cchain["Continual/Starpilot-v0"]
+
+
+def test_dqn_settings_differ_where_the_algorithms_do():
+    dqn, double, cchain = (shipped_settings(algo)["Continual/MinAtar-v0"] for algo in ("dqn", "double_dqn", "dqn_cchain"))
+    assert double == {**dqn, "double_q": True, "loss": "mse"}
+    churn = {key: value for key, value in cchain.items() if "churn" in key}
+    assert cchain == {**double, **churn}
+    assert (churn["churn_coef"], churn["target_churn_ratio"]) == ("auto_50", 0.01)
+    assert (churn["churn_warmup"], churn["churn_window"], churn["reset_churn_coef"]) == (10_000, 50_000, False)
+
+
+def test_c_chain_and_vanilla_differ_in_the_churn_arguments_alone():
+    ppo, cchain, callback = (shipped_settings(algo) for algo in ("ppo", "ppo_cchain", "ppo_cchain_callback"))
+    for env_id in GYM_CONTROL:
+        churn = {key: value for key, value in cchain[env_id].items() if "churn" in key}
+        assert cchain[env_id] == {**ppo[env_id], **churn}
+        assert churn["target_churn_ratio"] == 1e4
+    settings = callback["Continual/Acrobot-v1"]
+    assert settings["callback"].pop() == {"sb3_cchain.CChainCallback": churn}
+    assert settings == ppo["Continual/Acrobot-v1"]
+
+
+@pytest.mark.parametrize("algo", NEW_ALGOS)
+def test_defaults_hold_for_algorithms_that_rl_zoo_does_not_have(algo):
+    assert settings_file(algo, "CartPole-v1").name == f"{algo}.yml"
+
+
+def test_rl_zoos_own_settings_hold_where_we_have_none():
+    assert settings_file("ppo", "CartPole-v1") is None
+    assert settings_file("sac", "Continual/Acrobot-v1") is None
+    arguments = ["--algo", "ppo", "--env", "CartPole-v1"]
+    assert add_settings_file(arguments) == arguments
+
+
+@pytest.mark.parametrize("option", ["--conf-file", "--conf", "-conf"])
+def test_a_file_of_the_user_wins(option):
+    with pytest.raises(FileNotFoundError, match=r"mine\.yml"):
+        command("train", "--alg", "ppo_cchain", option, "mine.yml", "--env", "Continual/Acrobot-v1")
+
+
+# --- The related methods --------------------------------------------------------------------------------------------------
+
+ADAM = "optimizer_kwargs=dict(eps=1e-8, fused=True)"
+METRICS = ["sb3_cchain.methods.OptimizerMetrics"]
+ORACLE = "sb3_cchain.methods.Oracle"
+REDO = {"sb3_cchain.methods.ReDo": {"tau": 0.025, "interval": 10, "batch_size": 256}}
+
+
+def optimizer(name, arguments):
+    return f"optimizer_class=get_class_by_name('sb3_cchain.methods.{name}'), optimizer_kwargs=dict({arguments})"
+
+
+# The callbacks that are added, and what stands for Adam's arguments among those of the policy
+DIFFERENCES = {
+    ("ppo_oracle", "gym_control"): ([ORACLE], ADAM),
+    ("ppo_oracle", "procgen"): ([ORACLE], ""),
+    ("ppo_oracle", "dmc"): ([ORACLE], ""),
+    ("ppo_trac", "gym_control"): (METRICS, optimizer("TRAC", "base_kwargs=dict(eps=1e-8, fused=True)")),
+    ("ppo_trac", "procgen"): (METRICS, optimizer("TRAC", "base_kwargs=dict(eps=1e-8)")),
+    ("ppo_weight_clipping", "gym_control"): (
+        METRICS,
+        optimizer("WeightClipping", "clip_ratio=1.0, base_kwargs=dict(eps=1e-8, fused=True)"),
+    ),
+    ("ppo_weight_clipping", "procgen"): (METRICS, optimizer("WeightClipping", "clip_ratio=1.0, base_kwargs=dict(eps=1e-5)")),
+    ("ppo_l2_init", "gym_control"): (
+        METRICS,
+        optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-8, fused=True)"),
+    ),
+    ("ppo_l2_init", "procgen"): (METRICS, optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-5)")),
+    ("ppo_layer_norm", "procgen"): ([], "features_extractor_kwargs=dict(layer_norm=True)"),
+    ("ppo_redo", "procgen"): ([REDO], ""),
+    ("ppo_adam_rel", "procgen"): (["sb3_cchain.methods.AdamRel"], ""),
+    ("double_dqn_oracle", "minatar"): ([{ORACLE: {"reset_replay_buffer": True}}], ""),
+}
+
+
+def parsed(settings):
+    """Whatever the line breaks."""
+    expression = ast.parse(settings.get("policy_kwargs", "dict()"), mode="eval")
+    return {**settings, "policy_kwargs": ast.dump(expression)}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_differs_from_its_algorithm_in_itself_alone(method):
+    settings, vanilla = shipped_settings(method), shipped_settings(base_algo(BY_ALGO[method]))
+    expected = {}
+    for suite in (suite for name, suite in DIFFERENCES if name == method):
+        callbacks, arguments = DIFFERENCES[method, suite]
+        for env_id in SUITES[suite]:
+            env_settings = vanilla[env_id]
+            policy_kwargs = env_settings.get("policy_kwargs", f"dict({ADAM})" if arguments else "dict()").replace(
+                ADAM, arguments
+            )
+            expected[env_id] = {
+                **env_settings,
+                "callback": [*env_settings["callback"], *callbacks],
+                "policy_kwargs": policy_kwargs,
+            }
+    covered = {env_id: env_settings for env_id, env_settings in settings.items() if not env_id.endswith("-defaults")}
+    assert {env_id: parsed(env_settings) for env_id, env_settings in covered.items()} == {
+        env_id: parsed(env_settings) for env_id, env_settings in expected.items()
+    }
+
+
+METHOD_ROLLOUTS = {
+    "gym_control": ("Continual/Acrobot-v1", 64, 32),
+    "procgen": ("Continual/Starpilot-v0", 32, 16),
+    "dmc": ("Continual/Walker-v0", 64, 32),
+}
+
+
+@pytest.mark.parametrize("method, suite", [key for key in DIFFERENCES if key[1] != "minatar"])
+@pytest.mark.filterwarnings("ignore")
+def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, method, suite):
+    if sys.version_info >= (3, 13) and suite in ("procgen", "dmc"):
+        pytest.skip("no wheels")
+    env_id, n_steps, batch_size = METHOD_ROLLOUTS[suite]
+    short = [f"n_steps:{n_steps}", f"batch_size:{batch_size}", "n_epochs:1"]
+    train(tmp_path, method, env_id, 2 * n_steps, "--env-kwargs", f"steps_per_task:{n_steps}", "-params", *short)
+    (path,) = tmp_path.glob(f"{method}/*/*-v?.zip")
+    model = PPO.load(path, device="cpu")
+    assert type(model) is PPO and model.num_timesteps == 2 * n_steps and model._n_updates == 2
+    optimizer = model.policy.optimizer
+    names = {"ppo_trac": "TRAC", "ppo_weight_clipping": "WeightClipping", "ppo_l2_init": "L2Init"}
+    assert type(optimizer).__name__ == names.get(method, "Adam")
+    assert optimizer.param_groups[0]["eps"] == (1e-8 if suite == "gym_control" or method == "ppo_trac" else 1e-5)
+    # Two updates for each task, or those since the reset
+    n_updates = 2 if method in ("ppo_oracle", "ppo_adam_rel") else 4
+    assert {int(optimizer.state[parameter]["step"]) for parameter in model.policy.parameters()} == {n_updates}
+    assert sum(isinstance(module, th.nn.LayerNorm) for module in model.policy.features_extractor.modules()) == (
+        2 if method == "ppo_layer_norm" else 0
+    )
+
+
+@pytest.mark.parametrize("algo", ["ppo_layer_norm", "double_dqn_oracle"])
+def test_a_method_says_which_environments_it_covers(tmp_path, algo):
+    covered = PROCGEN if algo == "ppo_layer_norm" else SUITES["minatar"]
+    error = f"{algo}.yml has no settings for Continual/Acrobot-v1, only for {', '.join(covered)}. .* -conf FILE$"
+    with pytest.raises(SystemExit, match=error):
+        train(tmp_path, algo, "Continual/Acrobot-v1", 64)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_method_without_a_yaml_file_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr("sb3_cchain.zoo.settings.hyperparams_folder", lambda: tmp_path)
+    with pytest.raises(SystemExit, match="ppo_trac.yml has no settings for CartPole-v1, and for no other.* -conf FILE"):
+        train(tmp_path / "logs", "ppo_trac", "CartPole-v1", 64)
+
+
+def test_the_file_of_the_user_for_a_method():
+    arguments = ["--algo", "ppo_redo", "--env", "Continual/CartPole-v1", "-conf", "mine.yml"]
+    assert add_settings_file(arguments) == arguments
+
+
+# --- What RL Zoo saved beside a model -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        OrderedDict(env="CartPole-v1", env_kwargs=None, seed=3, track=False, learning_rate=1e-3),
+        OrderedDict(),
+        OrderedDict(env_kwargs={"size": (3, 4), "nested": OrderedDict(a=[1.5, "b"])}),
+        OrderedDict(policy_kwargs=dict(net_arch=[8], activation_fn=th.nn.ReLU)),
+    ],
+)
+def test_what_rl_zoo_writes_is_read(value):
+    read = yaml.load(yaml.dump(value), SettingsLoader)
+    assert read == value and type(read) is OrderedDict
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "!!python/object/apply:os.mkdir [made]",
+        "env_kwargs: !!python/object/apply:os.mkdir [made]",
+        "!!python/object/apply:collections.OrderedDict\n- - - env\n    - !!python/object/apply:os.mkdir [made]",
+        "!!python/object/new:os.mkdir [made]",
+        '!!python/object/apply:eval [\'__import__("os").mkdir("made")\']',
+        "!!python/module:antigravity",
+        "!!python/object/apply:collections.OrderedDict {a: 1}",
+    ],
+)
+def test_nothing_in_a_file_is_called(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(yaml.YAMLError):
+        yaml.load(text, SettingsLoader)
+    # enjoy, too, reads it by this loader
+    CChainPPO("MlpPolicy", "CartPole-v1", device="cpu").save("ppo_cchain/CartPole-v1.zip")
+    (tmp_path / "ppo_cchain" / "CartPole-v1").mkdir()
+    for name in ("args.yml", "config.yml"):
+        path = tmp_path / "ppo_cchain" / "CartPole-v1" / name
+        path.write_text(text)
+        with pytest.raises(yaml.YAMLError):
+            command("enjoy", "--algo", "ppo_cchain", "--env", "CartPole-v1", "-f", ".", "--exp-id", "-1", "--no-render")
+        path.unlink()
+    assert not (tmp_path / "made").exists()
+    assert yaml.UnsafeLoader is not SettingsLoader

@@ -1,0 +1,55 @@
+"""The command line, in this process and in one of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+import rl_zoo3.exp_manager
+import rl_zoo3.train
+import yaml
+
+import sb3_cchain.zoo.cli as zoo
+from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from sb3_cchain.zoo.settings import read_settings
+
+ROOT = Path(__file__).parent.parent
+DMC = ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"]
+PROCGEN = [f"Continual/{name}" for name, registration in CONTINUAL_ENVS.items() if "game" in registration.get("kwargs", {})]
+GYM_CONTROL = ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"]
+SUITES = {"gym_control": GYM_CONTROL, "procgen": PROCGEN, "dmc": DMC, "minatar": ["Continual/MinAtar-v0"]}
+
+FAST = ("--num-threads", "1", "--device", "cpu", "--verbose", "0")
+NO_EVALUATION = ("--eval-freq", "-1")
+# Few steps of PPO in a continual environment that is fast
+SHORT_PPO = ("-params", "n_steps:32", "batch_size:16", "n_epochs:1", "policy_kwargs:dict(net_arch=[8])")
+
+
+def command(*arguments):
+    """``sb3-cchain ...``"""
+    with mock.patch.object(sys, "argv", ["sb3-cchain", *map(str, arguments)]):
+        zoo.main()
+
+
+def stock_train(*arguments):
+    """``python -m rl_zoo3.train ...`` as it is without our command."""
+    with (
+        mock.patch.object(rl_zoo3.train, "ExperimentManager", rl_zoo3.exp_manager.ExperimentManager),
+        mock.patch.object(sys, "argv", ["train.py", *map(str, arguments)]),
+    ):
+        rl_zoo3.train.train()
+
+
+def run(*command, cwd, ok=True):
+    """``python -m ...``, its output."""
+    environment = {**os.environ, "MPLBACKEND": "agg", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    result = subprocess.run([sys.executable, "-m", *command], cwd=cwd, capture_output=True, text=True, env=environment)
+    assert (result.returncode == 0) == ok, result.stdout + result.stderr
+    return result.stdout + result.stderr
+
+
+def shipped_settings(algo):
+    settings = read_settings(algo)
+    assert settings == yaml.safe_load((ROOT / "zoo_hyperparams" / f"{algo}.yml").read_text())
+    return settings
