@@ -78,7 +78,7 @@ def test_a_torn_model_is_named_and_the_newest_whole_one_too(share, tmp_path):
         check_model_file(paths[2])
     for path in paths[:2]:
         path.unlink()
-    with pytest.raises(ValueError, match="There is no whole model beside it$"):
+    with pytest.raises(ValueError, match=r"There is no whole model beside it$"):
         check_model_file(paths[2])
 
 

@@ -209,7 +209,7 @@ def _make_many(folder):
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_run_folders_are_never_shared(tmp_path):
     with multiprocessing.get_context("fork").Pool(4) as pool:
-        made = sum(pool.map(_make_many, [tmp_path / "runs"] * 4, chunksize=1), [])
+        made = [folder for folders in pool.map(_make_many, [tmp_path / "runs"] * 4, chunksize=1) for folder in folders]
     assert sorted(made) == sorted(str(tmp_path / "runs" / f"run_{number}") for number in range(1, 81))
 
 

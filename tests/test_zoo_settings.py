@@ -5,7 +5,6 @@ import sys
 from collections import OrderedDict
 
 import pytest
-import rl_zoo3
 import torch as th
 import yaml
 from stable_baselines3 import DQN, PPO
@@ -45,8 +44,8 @@ def test_every_environment_has_settings():
 # Shorter than the settings', where a rollout of those takes long
 ROLLOUTS = {
     **{(algo, env_id): [] for env_id in GYM_CONTROL for algo in ("ppo", "ppo_cchain")},
-    **{(algo, env_id): ["n_steps:16", "batch_size:16", "n_epochs:1"] for env_id in PROCGEN for algo in ("ppo", "ppo_cchain")},
-    **{(algo, env_id): ["n_steps:64", "n_epochs:1"] for env_id in DMC for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:32", "batch_size:16", "n_epochs:1"] for env_id in PROCGEN for algo in ("ppo", "ppo_cchain")},
+    **{(algo, env_id): ["n_steps:128", "n_epochs:1"] for env_id in DMC for algo in ("ppo", "ppo_cchain")},
     **{(algo, "Continual/MinAtar-v0"): ["buffer_size:1000"] for algo in ("dqn", "double_dqn", "dqn_cchain")},
 }
 
@@ -228,7 +227,7 @@ def test_a_method_says_which_environments_it_covers(tmp_path, algo):
 
 def test_a_method_without_a_yaml_file_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr("sb3_cchain.zoo.settings.hyperparams_folder", lambda: tmp_path)
-    with pytest.raises(SystemExit, match="ppo_trac.yml has no settings for CartPole-v1, and for no other.* -conf FILE"):
+    with pytest.raises(SystemExit, match=r"ppo_trac\.yml has no settings for CartPole-v1, and for no other.* -conf FILE"):
         train(tmp_path / "logs", "ppo_trac", "CartPole-v1", 64)
 
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_cchain.analysis.inspection import algorithm_of, inspect_model, plot, report
 from sb3_cchain.checkpoint import check_model_file
-from sb3_cchain.zoo.settings import SettingsLoader
+from sb3_cchain.zoo.settings import read_saved
 
 
 def make_as_trained(
@@ -40,15 +40,12 @@ def make_as_trained(
     :param seed: Seed
     :param env_kwargs: Arguments of the environment, besides those it was trained with
     :return: The environment, as in training, and the callbacks
-    :raises ValueError: When the ``args.yml`` beside the model is not one of RL Zoo's
+    :raises ValueError: When the YAML files beside the model are not as RL Zoo writes them
     """
     folder = model_path.parent / env_id.replace("/", "-")
+    env_kwargs = {**(read_saved(folder / "args.yml").get("env_kwargs") or {}), **env_kwargs}
+    read_saved(folder / "config.yml")  # for its errors
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
-    if (folder / "args.yml").is_file():
-        arguments = yaml.load((folder / "args.yml").read_text(), Loader=SettingsLoader)
-        if not isinstance(arguments, dict):
-            raise ValueError(f"{folder / 'args.yml'} must map names to values, as RL Zoo writes it")
-        env_kwargs = {**(arguments.get("env_kwargs") or {}), **env_kwargs}
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
     callbacks = get_callback_list(hyperparams)
     env = create_test_env(
@@ -204,8 +201,12 @@ def main(arguments: Sequence[str]) -> None:
     for name, path in zip(names, args.models, strict=True):
         try:
             model, callbacks = load_as_trained(path, args.algo, args.env, env_kwargs, args.seed, args.n_steps, args.device)
-        except (TypeError, ValueError, yaml.YAMLError, gym.error.Error) as error:
-            message = " ".join(str(error).split())
+        except (
+            *(TypeError, ValueError, yaml.YAMLError, gym.error.Error),
+            # Of settings that name what is not there
+            *(AttributeError, ImportError, NameError, SyntaxError),
+        ) as error:
+            message = " ".join(str(error).split())  # in one line
             parser.error(f"{path} in {args.env} {env_kwargs or ''}: {message}")
         if model.lr_schedule(model._current_progress_remaining) == 0:
             console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")

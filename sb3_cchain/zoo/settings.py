@@ -97,6 +97,21 @@ class SettingsLoader(yaml.FullLoader):
     """
 
 
+def read_saved(path: Path) -> dict[str, Any]:
+    """
+    :param path: An ``args.yml`` or ``config.yml`` of RL Zoo
+    :return: Its content; empty if there is no such file
+    :raises ValueError: When it does not map names to values
+    """
+    if not path.is_file():
+        return {}
+    with open(path) as file:
+        content = yaml.load(file, Loader=SettingsLoader)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must map names to values, as RL Zoo writes it")
+    return content
+
+
 def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict:
     if not isinstance(node, yaml.SequenceNode):
         raise yaml.constructor.ConstructorError(None, None, "an OrderedDict must be a list of pairs", node.start_mark)

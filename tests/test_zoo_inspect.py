@@ -1,0 +1,146 @@
+"""``sb3-cchain inspect``: one line where a file cannot be inspected, before the work starts."""
+
+import json
+import os
+import re
+
+import pytest
+import torch as th
+import yaml
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.save_util import save_to_zip_file
+
+import sb3_cchain.zoo.inspect
+from sb3_cchain import CChainPPO
+from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
+
+
+def make(algorithm=PPO, **kwargs):
+    settings = dict(buffer_size=50) if algorithm is DQN else dict(n_steps=8)
+    if algorithm in (PPO, CChainPPO):
+        settings.update(batch_size=8, n_epochs=1)
+    return algorithm("MlpPolicy", "CartPole-v1", policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu", **settings)
+
+
+@pytest.fixture(autouse=True)
+def no_work(monkeypatch):
+    """Errors come before it."""
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", lambda *_: pytest.fail("work started"))
+
+
+def error_of(capsys, *arguments):
+    """The one line that the command ends with."""
+    with pytest.raises(SystemExit) as exit_info:
+        command("inspect", *arguments, "--env", "CartPole-v1", "--device", "cpu")
+    assert exit_info.value.code == 2
+    usage, line = capsys.readouterr().err.rstrip("\n").split("sb3-cchain inspect: error: ")
+    assert usage.startswith("usage") and "\n" not in line
+    return line
+
+
+def without_data(path):
+    save_to_zip_file(path, params=make().get_parameters())
+
+
+def torn(path):
+    make().save(path)
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def not_finite(path):
+    model = make()
+    with th.no_grad():
+        model.policy.value_net.weight[0, 0] = th.nan
+    model.save(path)
+
+
+def of_other_shapes(path):
+    model = make()
+    model.policy_kwargs = dict(net_arch=[5])
+    model.save(path)
+
+
+@pytest.mark.parametrize(
+    "write, message",
+    [
+        (without_data, "without the model's settings (no entry `data`): save it by the model's save()"),
+        (torn, "is torn or not a saved model"),
+        (lambda path: path.write_text("no zip"), "is torn or not a saved model"),
+        (not_finite, "parameter value_net.weight has entries that are not finite"),
+        (of_other_shapes, "cannot be loaded as PPO: RuntimeError('Error(s) in loading state_dict"),
+    ],
+)
+def test_what_is_no_model_that_can_be_inspected(write, message, tmp_path, capsys):
+    write(tmp_path / "model.zip")
+    line = error_of(capsys, tmp_path / "model.zip", "--output", tmp_path / "output")
+    assert str(tmp_path / "model.zip") in line and message in line
+
+
+@pytest.mark.parametrize(
+    "saved_by, algo, message",
+    [
+        (DQN, "ppo", "it was not saved by PPO (its policy is a DQNPolicy): --algo ppo"),
+        (PPO, "dqn", "it was not saved by DQN (its policy is a ActorCriticPolicy): --algo dqn"),
+        (DQN, "qrdqn", "it was not saved by QRDQN (its policy is a DQNPolicy): --algo qrdqn"),
+        (PPO, "a2c", "it was saved by PPO, not by A2C: leave --algo a2c away"),
+    ],
+)
+def test_the_wrong_algorithm(saved_by, algo, message, tmp_path, capsys):
+    make(saved_by).save(tmp_path / "model.zip")
+    assert message in error_of(capsys, tmp_path / "model.zip", "--algo", algo, "--output", tmp_path)
+
+
+@pytest.mark.parametrize("saved_by, algo", [(PPO, "ppo"), (CChainPPO, "ppo_cchain"), (PPO, "ppo_trac"), (A2C, "a2c")])
+def test_the_right_algorithm(saved_by, algo, tmp_path, monkeypatch):
+    make(saved_by).save(tmp_path / "model.zip")
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", lambda model, *_: (_ for _ in ()).throw(Started(model)))
+    with pytest.raises(Started) as started:
+        command("inspect", tmp_path / "model.zip", "--algo", algo, "--env", "CartPole-v1", "--output", tmp_path)
+    assert type(started.value.args[0]) is saved_by
+
+
+class Started(Exception):
+    """The work did, with a model."""
+
+
+@pytest.mark.parametrize("name", ["args.yml", "config.yml"])
+@pytest.mark.parametrize("text", ["a: [", "!!python/object/apply:os.mkdir [made]", "- a list"])
+def test_broken_yaml_beside_the_model(name, text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make().save(tmp_path / "model.zip")
+    (tmp_path / "CartPole-v1").mkdir()
+    (tmp_path / "CartPole-v1" / name).write_text(text)
+    line = error_of(capsys, tmp_path / "model.zip", "--output", "output")
+    assert "model.zip" in line and name in line and re.search("while parsing|python/object|must map", line)
+    assert not (tmp_path / "made").exists()
+
+
+def test_output_that_cannot_be_written_to(tmp_path, monkeypatch, capsys):
+    make().save(tmp_path / "model.zip")
+    (tmp_path / "file").touch()
+    mend = "Give a folder that can be written to"
+    for output in (tmp_path / "file", tmp_path / "file" / "below"):
+        line = error_of(capsys, tmp_path / "model.zip", "--output", output)
+        assert line.startswith(f"--output {output}: ") and line.endswith(mend)
+
+    def full(*_, **__):
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "TemporaryFile", full)
+    line = error_of(capsys, tmp_path / "model.zip", "--output", tmp_path / "full")
+    assert line == f"--output {tmp_path / 'full'}: No space left on device. {mend}"
+
+
+def test_arguments_that_rl_zoo_saved_are_used(tmp_path, monkeypatch):
+    """Written by RL Zoo, read by our loader."""
+    env_kwargs = ("--env-kwargs", "n_tasks:2", "offsets:[[0.0]*4,[0.5]*4]")
+    options = ("--env", "Continual/CartPole-v1", "-n", "32", "-f", tmp_path, *FAST, *NO_EVALUATION, *env_kwargs)
+    command("train", "--algo", "ppo", *options, *SHORT_PPO)
+    (folder,) = tmp_path.glob("ppo/*_1")
+    saved = yaml.load((folder / "Continual-CartPole-v1" / "args.yml").read_text(), yaml.UnsafeLoader)
+    assert saved["env_kwargs"]["n_tasks"] == 2
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", lambda model, *_: (_ for _ in ()).throw(Started(model)))
+    with pytest.raises(Started) as started:
+        command("inspect", folder / "Continual-CartPole-v1.zip", "--env", "Continual/CartPole-v1", "--output", tmp_path)
+    env = started.value.args[0].env
+    assert env.get_attr("n_tasks") == [2] and json.dumps(env.get_attr("offsets")[0].tolist())[:2] == "[["
