@@ -1,6 +1,8 @@
 """CChainDQN runs wherever DQN does, and says what it does."""
 
 import copy
+import weakref
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
-from sb3_cchain.algorithms import off_policy
+from sb3_cchain.algorithms import dqn_cchain
 from sb3_cchain.networks.extractors import MinAtarCNN
 from tests.envs import CountEnv, RandomEnv
 
@@ -85,7 +87,18 @@ def test_other_arguments_of_dqn(arguments, n_updates):
     assert model._n_updates == n_updates
     assert_churn_was_reduced(model)
     assert isinstance(model.replay_buffer, NStepReplayBuffer) == ("n_steps" in arguments)
-    assert "zero_grad" not in vars(model.policy.optimizer) and model.q_net_target is model.policy.q_net_target
+
+
+@pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+def test_frozen_layers_stay_as_they_are(cls):
+    model = cls("MlpPolicy", RandomEnv(), **SETTINGS)
+    frozen, trained = model.q_net.q_net[0], model.q_net.q_net[-1]
+    frozen.requires_grad_(False)
+    before = [layer.weight.clone() for layer in (frozen, trained)]
+    model.learn(50, log_interval=10**6)
+    assert th.equal(frozen.weight, before[0]) and not th.equal(trained.weight, before[1])
+    if cls is CChainDQN:
+        assert_churn_was_reduced(model)
 
 
 def test_hindsight_experience_replay():
@@ -138,7 +151,7 @@ def other_settings(name):
 def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, monkeypatch):
     models = []
     for own_pass in (False, True):
-        monkeypatch.setattr(off_policy, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
+        monkeypatch.setattr(dqn_cchain, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
         models.append(learn(n_timesteps=80, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
     for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.allclose(p, q, rtol=0, atol=1e-5)
@@ -171,10 +184,10 @@ def test_an_interrupted_update_leaves_nothing_behind():
     with pytest.raises(KeyboardInterrupt):
         model.train(gradient_steps=1, batch_size=8)
     model.policy.optimizer.step = step
-    assert model.q_net is model.policy.q_net and model.q_net_target is model.policy.q_net_target
+    assert model.churn_reducer.losses == []
     n_seen = int(model.churn_reducer.coefficient.n_seen)
     model.train(gradient_steps=3, batch_size=8)
-    assert model.churn_reducer.coefficient.n_seen == n_seen + 1
+    assert model.churn_reducer.coefficient.n_seen == n_seen + 3
     assert model.churn_reducer.losses == []
 
 
@@ -198,26 +211,70 @@ def test_what_is_logged(double_q):
         seen.append((reference, copy.deepcopy(model.policy.q_net)))
         remember(reference, outputs)
 
-    reducer.remember = remember
+    td_losses = []
+    reducer.remember, reducer.end_iteration = remember, td_losses.append
     model.logger.name_to_value.clear()
     model.train(gradient_steps=2, batch_size=8)
     (reference, before), (_, after) = seen
+    (td_loss,) = td_losses
     with th.no_grad():
         old, new = before(reference), after(reference)
     logged = model.logger.name_to_value
     assert logged["churn/loss"] == pytest.approx(((old - new) ** 2).mean().item())
     assert logged["churn/coef"] == 2.0
-    assert logged["churn/relative_loss"] == pytest.approx(2 * logged["churn/loss"] / logged["train/loss"], rel=1e-4)
+    assert logged["churn/relative_loss"] == pytest.approx(2 * logged["churn/loss"] / td_loss, rel=1e-4)
     assert logged["churn/value_churn"] == pytest.approx((old - new).abs().mean().item())
     changes = [int(a.argmax() != b.argmax()) for a, b in zip(old, new, strict=True)]
     assert 0 < sum(changes) < 8
     assert logged["churn/greedy_action_changes"] == pytest.approx(np.mean(changes))
 
 
-def test_logs_are_means_over_the_updates_between_two_logs():
-    model = learn(n_timesteps=23, churn_warmup=1, churn_window=100, target_churn_ratio=0.5)
-    history = model.churn_reducer.coefficient.churn_losses[:2]
-    assert model.logger.name_to_value["churn/loss"] == pytest.approx(history.mean().item())
+@pytest.mark.parametrize("gradient_steps, n_updates", [(1, 2), (3, 8)])  # with a churn loss, in three calls of train()
+def test_logs_are_means_over_the_updates_between_two_logs(gradient_steps, n_updates):
+    settings = dict(churn_warmup=1, churn_window=100, target_churn_ratio=0.5, gradient_steps=gradient_steps)
+    model = learn(n_timesteps=23, **settings)
+    coefficient = model.churn_reducer.coefficient
+    assert coefficient.n_seen == n_updates
+    assert model.logger.name_to_value["churn/loss"] == pytest.approx(coefficient.churn_losses[:n_updates].mean().item())
+
+
+@pytest.mark.parametrize("double_q", [False, True])
+def test_updates_of_one_call_are_those_of_several_calls(double_q):
+    """λ, its warm-up and its window are counted in gradient updates."""
+    models = []
+    for calls in ([6], [1] * 6, [2, 4]):
+        settings = dict(double_q=double_q, churn_coef="auto_20", churn_warmup=3, churn_window=4)
+        models.append(CChainDQN("MlpPolicy", RandomEnv(), **SETTINGS, **settings).learn(20))
+        np.random.seed(0)
+        for gradient_steps in calls:
+            models[-1].train(gradient_steps, batch_size=8)
+        assert models[-1].churn_reducer.coefficient.n_seen == 5
+    first, *others = models
+    assert first.churn_reducer.coefficient.value != 20
+    for other in others:
+        assert all(th.equal(p, q) for p, q in zip(first.policy.parameters(), other.policy.parameters(), strict=True))
+        assert first.churn_reducer.coefficient.value == other.churn_reducer.coefficient.value
+
+
+def test_no_update_is_held_until_the_call_ends():
+    model = learn()
+    outputs = []
+
+    def remember(reference, old_outputs, remember=model.churn_reducer.remember):
+        outputs.append(weakref.ref(old_outputs))
+        remember(reference, old_outputs)
+
+    alive = []
+    model.churn_reducer.remember = remember
+    step = model.policy.optimizer.step
+
+    def count_and_step():
+        alive.append(sum(output() is not None for output in outputs))
+        step()
+
+    model.policy.optimizer.step = count_and_step
+    model.train(gradient_steps=10, batch_size=8)
+    assert max(alive) <= 2
 
 
 def test_adaptive_coefficient_holds_the_ratio():
@@ -242,13 +299,53 @@ def test_another_policy_put_in_place():
     assert_churn_was_reduced(model)
 
 
-def test_not_a_number_raises_and_leaves_the_parameters_finite():
+def state_of(model):
+    """Parameters, and C-CHAIN's numbers."""
+    coefficient = model.churn_reducer.coefficient.state_dict() if isinstance(model, CChainDQN) else {}
+    return [tensor.clone() for tensor in (*model.policy.state_dict().values(), *coefficient.values())]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [DoubleDQN, partial(CChainDQN, churn_warmup=3), partial(CChainDQN, churn_coef=0.0)],
+    ids=["DoubleDQN", "CChainDQN", "CChainDQN with coefficient 0"],
+)
+@pytest.mark.parametrize("loss", ["huber", "mse"])
+@pytest.mark.parametrize(
+    "where, value, message",
+    [
+        ("rewards", np.inf, "the rewards of the minibatch hold inf"),
+        ("rewards", -np.inf, "the rewards of the minibatch hold -inf"),
+        ("rewards", np.nan, "the rewards of the minibatch hold nan"),
+        ("rewards", 3e38, "the network.*finite .the largest reward is 3e.38"),
+        ("observations", np.nan, "the observations of the minibatch hold nan"),
+        ("next_observations", np.nan, "the next observations of the minibatch hold nan"),
+    ],
+)
+def test_what_is_not_finite_is_named_before_an_update(make, loss, where, value, message):
+    """After the warm-up, in which λ would become infinite, too."""
+    model = make("MlpPolicy", RandomEnv(), loss=loss, **SETTINGS).learn(40)
+    getattr(model.replay_buffer, where)[:40] = value
+    before = state_of(model)
+    with pytest.raises(ValueError, match=rf"The TD loss is \S+: {message}.*have not been updated"):
+        model.train(gradient_steps=2, batch_size=8)
+    assert all(th.equal(*pair) for pair in zip(before, state_of(model), strict=True))
+
+
+def test_huge_rewards_are_no_error():
+    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=1.0, **SETTINGS).learn(40)
+    model.replay_buffer.rewards[:40] *= 1e30
+    model.train(gradient_steps=1, batch_size=8)
+    assert all(tensor.isfinite().all() for tensor in state_of(model))
+
+
+def test_an_infinite_churn_loss_is_named_before_an_update():
     model = learn()
     model.churn_reducer.old_outputs.fill_(float("nan"))
+    before = state_of(model)
     with pytest.raises(ValueError, match="The churn loss is nan"):
-        model.learn(50)
-    assert all(p.isfinite().all() for p in model.policy.parameters())
-    assert "zero_grad" not in vars(model.policy.optimizer) and model.q_net_target is model.policy.q_net_target
+        model.train(gradient_steps=1, batch_size=8)
+    assert all(th.equal(*pair) for pair in zip(before, state_of(model), strict=True))
 
 
 def test_continual_environment_brings_its_callbacks():
@@ -268,10 +365,11 @@ def test_continual_environment_brings_its_callbacks():
     "action_space", [spaces.Box(-1, 1, (2,), np.float32), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)], ids=str
 )
 def test_other_actions_are_refused(cls, action_space):
+    """With the kind of error that SB3 raises."""
     message = f"{cls.__name__} needs an environment with Discrete actions, got {type(action_space).__name__}"
-    with pytest.raises(TypeError, match=message):
+    with pytest.raises(AssertionError, match=message):
         cls("MlpPolicy", RandomEnv(action_space=action_space))
-    with pytest.raises(TypeError, match="Discrete actions, got Box"):
+    with pytest.raises(AssertionError, match="Discrete actions, got Box"):
         cls("MlpPolicy", "Pendulum-v1")
 
 

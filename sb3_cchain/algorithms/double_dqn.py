@@ -1,33 +1,25 @@
 """Double DQN."""
 
-from collections.abc import Callable
+import warnings
 from contextlib import nullcontext
-from functools import partial
-from types import FunctionType, SimpleNamespace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs
-from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples
+from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional as F
 
+from sb3_cchain.algorithms.off_policy import finite_td_loss
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
-from sb3_cchain.replaced import replaced
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
-# SB3's own training step for another loss: the same code, for which the name `F` stands for something else. Whatever a release
-# of SB3 changes there is changed here too; another function of `F` raises an AttributeError.
-_train_mse = FunctionType(
-    DQN.train.__code__,
-    {**DQN.train.__globals__, "F": SimpleNamespace(smooth_l1_loss=F.mse_loss)},
-    DQN.train.__name__,
-    DQN.train.__defaults__,
-    DQN.train.__closure__,
-)
+LOSSES = {"huber": F.smooth_l1_loss, "mse": F.mse_loss}
 
 
 class DoubleDQN(DQN):
@@ -36,8 +28,8 @@ class DoubleDQN(DQN):
 
     Paper: https://arxiv.org/abs/1509.06461 (van Hasselt et al., AAAI 2016)
 
-    It is SB3's :class:`~stable_baselines3.DQN`, with all of its arguments and its ``train()``; the greedy action in the next
-    state is the online network's, its value the target network's:
+    It is SB3's :class:`~stable_baselines3.DQN`, with all of its arguments. The online network chooses the greedy action in the
+    next state, and the target network gives its value:
     :math:`r + \gamma \, Q_{target}(s', \arg\max_a Q(s', a))`.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -47,7 +39,8 @@ class DoubleDQN(DQN):
     :param loss: Loss of the TD error: ``"huber"`` as SB3, or ``"mse"`` as the C-CHAIN paper's Double DQN
     :param kwargs: Further keyword arguments of DQN
     :raises ValueError: For a ``loss`` that is neither, or n-step returns with ``Dict`` observations
-    :raises TypeError: When ``double_q`` is not a boolean or the actions are not ``Discrete``
+    :raises TypeError: When ``double_q`` is not a boolean
+    :raises AssertionError: When the actions are not ``Discrete``, as SB3's DQN
     """
 
     def __init__(
@@ -62,49 +55,115 @@ class DoubleDQN(DQN):
         self.double_q = double_q
         self.loss = loss
         self._check_arguments()  # before an environment is made
-        if env is not None:  # as when a model is loaded without one
+        if env is not None:  # it is None when a model is loaded without an environment
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             if not isinstance(env.action_space, spaces.Discrete):
-                raise TypeError(f"{type(self).__name__} needs an environment with Discrete actions, got {env.action_space}")
+                raise AssertionError(
+                    f"{type(self).__name__} needs an environment with Discrete actions, got {env.action_space}"
+                )
         super().__init__(policy, env, *args, **kwargs)
 
     def _check_arguments(self) -> None:
         if not isinstance(self.double_q, bool):
             raise TypeError(f"`double_q` must be True or False, got {self.double_q!r}")
-        if self.loss not in ("huber", "mse"):
+        if self.loss not in tuple(LOSSES):
             raise ValueError(f'`loss` must be "huber" or "mse", got {self.loss!r}')
 
     def _setup_model(self) -> None:
-        self._check_arguments()  # again: `load()` may have changed them
+        self._check_arguments()  # again, because `load()` may have changed them
         if self.n_steps > 1 and self.replay_buffer_class is None and isinstance(self.observation_space, spaces.Dict):
-            raise ValueError(f"SB3 has n-step returns for Dict observations not yet: set `n_steps=1`, got {self.n_steps!r}")
+            raise ValueError(
+                f"SB3 does not support n-step returns for Dict observations yet: set `n_steps=1`, got {self.n_steps!r}"
+            )
         super()._setup_model()
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
-        Update the Q-network, as DQN does, with Double Q-learning and the chosen loss.
+        Update the Q-network, as SB3's DQN does, with Double Q-learning and the chosen loss.
 
-        :param gradient_steps: Number of updates
+        :param gradient_steps: Number of gradient updates
         :param batch_size: Minibatch size
+        :raises ValueError: When the loss is NaN or infinite. The parameters have not been updated.
         """
-        double_q = replaced(self, "q_net_target", self._double_q_values(self.q_net_target)) if self.double_q else nullcontext()
-        with double_q:
-            if self.loss == "mse":
-                _train_mse(self, gradient_steps, batch_size)
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+
+        td_losses = []
+        for _ in range(gradient_steps):
+            assert self.replay_buffer is not None
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            loss, td_loss = self._loss(replay_data, batch_size)
+            td_losses.append(td_loss)
+
+            self.policy.optimizer.zero_grad()
+            loss.backward()
+            th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", np.mean(td_losses))
+
+    def _loss(self, replay_data: ReplayBufferSamples, batch_size: int) -> tuple[th.Tensor, float]:
+        """
+        :param replay_data: A minibatch
+        :param batch_size: The number of transitions that were asked for
+        :return: The loss to minimise, and the value of the TD loss, which is logged
+        """
+        loss = self._td_loss(replay_data, *self._q_values(replay_data))
+        return loss, finite_td_loss(loss, replay_data)
+
+    def _q_values(self, replay_data: ReplayBufferSamples) -> tuple[th.Tensor, th.Tensor | None]:
+        """
+        :param replay_data: A minibatch
+        :return: The online network's action values ``(batch_size, n_actions)`` of the observations, and those of the next
+            observations, without gradient; None without Double Q-learning, which does not need them
+        """
+        next_q_values = None
+        if self.double_q:
+            # As the target network: next observations do not move the running statistics of BatchNorm, and no dropout
+            with th.no_grad(), as_it_acts(self.policy) if has_training_mode(self.q_net) else nullcontext():
+                next_q_values = self.q_net(replay_data.next_observations)
+        return self.q_net(replay_data.observations), next_q_values
+
+    def _td_loss(self, replay_data: ReplayBufferSamples, q_values: th.Tensor, next_q_values: th.Tensor | None) -> th.Tensor:
+        """
+        :param replay_data: A minibatch
+        :param q_values: As returned by ``_q_values()``
+        :param next_q_values: As returned by ``_q_values()``
+        :return: The mean loss of the TD errors
+        """
+        # For n-step replay, the discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        with th.no_grad():
+            next_values = self.q_net_target(replay_data.next_observations)
+            if next_q_values is None:
+                next_values = next_values.max(dim=1, keepdim=True).values
             else:
-                super().train(gradient_steps, batch_size)
+                next_values = next_values.gather(dim=1, index=next_q_values.argmax(dim=1, keepdim=True))
+            targets = replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
+        return LOSSES[self.loss](q_values.gather(dim=1, index=replay_data.actions.long()), targets)
 
-    def _double_q_values(self, q_net_target: QNetwork) -> Callable[[PyTorchObs], th.Tensor]:
-        # As the target network: with running BatchNorm statistics, which next observations do not move, and without dropout
-        acting = partial(as_it_acts, self.policy) if has_training_mode(self.policy) else nullcontext
-
-        def values(next_observations: PyTorchObs) -> th.Tensor:
-            with acting():
-                greedy_actions = self.q_net(next_observations).argmax(dim=1, keepdim=True)
-            # (batch_size, 1): DQN takes the maximum over the columns, of which there is one
-            return q_net_target(next_observations).gather(1, greedy_actions)
-
-        return values
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        assert self.replay_buffer is not None
+        n_transitions = self.replay_buffer.size() * self.n_envs
+        if self.num_timesteps > self.learning_starts and n_transitions < min(self.batch_size, self.num_timesteps):
+            warnings.warn(
+                f"Training goes on at step {self.num_timesteps}, after `learning_starts={self.learning_starts}`, with "
+                f"{n_transitions} transitions in the replay buffer: the next updates are made on very few transitions. A "
+                "saved model does not hold its replay buffer: call `save_replay_buffer()` and `load_replay_buffer()`, or "
+                "raise `learning_starts` to collect new transitions first."
+            )
+        return result
 
     def learn(
         self: SelfDoubleDQN,

@@ -2,12 +2,15 @@
 
 from typing import Any, TypeVar
 
-from stable_baselines3.common.type_aliases import MaybeCallback
+import torch as th
+from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSamples
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
-from sb3_cchain.algorithms.off_policy import make_q_reducer, reduced_q_churn
+from sb3_cchain.algorithms.off_policy import QValues, finite_td_loss, joint_pass, log_q_churn, make_q_reducer
 from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.churn.reducer import Observations
+from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
 
 SelfCChainDQN = TypeVar("SelfCChainDQN", bound="CChainDQN")
 
@@ -51,18 +54,46 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     def _make_churn_reducer(self) -> ChurnReducer:
         return make_q_reducer(self, self._make_churn_coefficient)
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def _loss(self, replay_data: ReplayBufferSamples, batch_size: int) -> tuple[th.Tensor, float]:
         """
-        Update the Q-network, as DoubleDQN does, with churn reduction.
+        :param replay_data: A minibatch
+        :param batch_size: Size of the reference batch
+        :return: The TD loss plus λ·L_churn, and the value of the TD loss, which is logged
+        """
+        reducer = self.churn_reducer
+        if reducer.coefficient.is_zero:
+            return super()._loss(replay_data, batch_size)
 
-        :param gradient_steps: Number of updates
-        :param batch_size: Size of the minibatches and of the reference batches
-        """
-        if self.churn_reducer.coefficient.is_zero:
-            super().train(gradient_steps, batch_size)
-        else:
-            with reduced_q_churn(self, self.churn_reducer, batch_size):
-                super().train(gradient_steps, batch_size)
+        # Independent of the minibatch. It waits for the next update, which measures on it what this update changes
+        assert self.replay_buffer is not None
+        reference = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env).observations
+        values = self._all_q_values(replay_data, reference)
+
+        td_loss = self._td_loss(replay_data, values.current, values.next)
+        td_loss_value = finite_td_loss(td_loss, replay_data)
+        loss = td_loss
+        if values.previous_reference is not None:  # the first update has no previous one
+            coef = reducer.coefficient.value
+            loss = td_loss + reducer.loss(values.previous_reference)
+            assert reducer.old_outputs is not None
+            log_q_churn(
+                self.logger, coef, reducer.losses[-1], td_loss_value, reducer.old_outputs, values.previous_reference.detach()
+            )
+            reducer.end_iteration(td_loss_value)
+        reducer.remember(reference, values.reference)
+        return loss, td_loss_value
+
+    def _all_q_values(self, replay_data: ReplayBufferSamples, reference: Observations) -> QValues:
+        previous = self.churn_reducer.reference
+        if not has_training_mode(self.q_net):
+            return joint_pass(self.q_net, replay_data, reference, previous, self.double_q)
+        # Reference batches go through the network as it acts in the environment: they do not move the running statistics
+        # of BatchNorm, and the noise of dropout is no churn
+        current, next_values = self._q_values(replay_data)
+        with as_it_acts(self.policy):
+            previous_values = None if previous is None else self.q_net(previous)
+            with th.no_grad():
+                return QValues(current, next_values, self.q_net(reference), previous_values)
 
     def learn(
         self: SelfCChainDQN,

@@ -1,18 +1,19 @@
-"""Churn reduction of an unmodified ``DQN.train()``: where reference batches come from, where the gradient goes in."""
+"""Churn reduction of a Q-network: its reducer, the forward passes that it shares with DQN's update, and what is logged."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import math
+from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch as th
 from stable_baselines3 import DQN
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient, mean_squared_difference
+from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, mean_squared_difference
 from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.policy_inputs import n_observations
-from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
-from sb3_cchain.replaced import replaced
 
 # β when `target_churn_ratio="auto"`: the paper's
 DEFAULT_TARGET_RATIO = 0.01
@@ -24,7 +25,7 @@ def make_q_reducer(model: DQN, make_coefficient: Callable[[float], ChurnCoeffici
     :param make_coefficient: Makes λ, given the default β
     :return: The reducer of the Q-network's churn: the mean squared change of all action values
     """
-    # A partial, which deepcopy() of the model follows, as it does not a closure
+    # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
     return ChurnReducer(partial(_q_values, model), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO))
 
 
@@ -32,108 +33,119 @@ def _q_values(model: DQN, observations: Observations) -> th.Tensor:
     return model.policy.q_net(observations)
 
 
-@contextmanager
-def reduced_q_churn(model: DQN, reducer: ChurnReducer, batch_size: int) -> Iterator[None]:
+class QValues(NamedTuple):
+    """The online network's action values that an update of C-CHAIN DQN needs, ``(batch_size, n_actions)`` each."""
+
+    # Of the minibatch's observations
+    current: th.Tensor
+    # Of its next observations, without gradient; None without Double Q-learning
+    next: th.Tensor | None
+    # Of the reference batch that the next update's churn loss is computed on, without gradient
+    reference: th.Tensor
+    # Of the reference batch of the update before; None in the first update
+    previous_reference: th.Tensor | None
+
+
+def joint_pass(
+    q_net: Callable[[Observations], th.Tensor],
+    replay_data: ReplayBufferSamples,
+    reference: Observations,
+    previous_reference: Observations | None,
+    double_q: bool,
+) -> QValues:
     """
-    Run ``model``'s own ``train()`` in this block to train it with churn reduction.
+    Compute all action values in the two forward passes of Double DQN: the reference batch goes through the network together
+    with the next observations (no gradient), the reference batch of the update before together with the observations.
+    Without Double Q-learning the reference batch needs a pass of its own, because DQN's next observations go through the
+    target network only.
 
-    The reference batch is a sample of the replay buffer, of the minibatch's size and independent of it.
+    Right only where the outputs of one sample do not depend on the other samples, nor on training or evaluation mode.
 
-    Afterwards λ has been updated and ``churn/…`` logged, averaged over the calls of ``train()`` between two logs:
+    :param q_net: The online network
+    :param replay_data: The minibatch
+    :param reference: The reference batch that was drawn for the next update
+    :param previous_reference: The reference batch that was drawn in the update before
+    :param double_q: Whether the next observations' values are needed
+    :return: The action values
+    """
+    next_values = None
+    with th.no_grad():
+        if double_q:
+            next_values, reference_values = _both(q_net, replay_data.next_observations, reference)
+        else:
+            reference_values = q_net(reference)
+    if previous_reference is None:
+        return QValues(q_net(replay_data.observations), next_values, reference_values, None)
+    values, previous_values = _both(q_net, replay_data.observations, previous_reference)
+    return QValues(values, next_values, reference_values, previous_values)
 
-    - ``churn/loss``: mean churn loss L_churn over the updates, the mean squared change of all action values
+
+def _both(
+    q_net: Callable[[Observations], th.Tensor], minibatch: Observations, reference: Observations
+) -> tuple[th.Tensor, th.Tensor]:
+    """One pass for two batches."""
+    if isinstance(minibatch, dict) and isinstance(reference, dict):
+        together: Observations = {key: th.cat([minibatch[key], reference[key]]) for key in minibatch}
+    else:
+        assert th.is_tensor(minibatch) and th.is_tensor(reference)
+        together = th.cat([minibatch, reference])
+    values, reference_values = q_net(together).split([n_observations(minibatch), n_observations(reference)])
+    return values, reference_values
+
+
+def log_q_churn(logger: Logger, coef: float, churn_loss: float, td_loss: float, old: th.Tensor, new: th.Tensor) -> None:
+    """
+    Log the churn of one update. The logger averages over the updates between two logs, and holds no tensor.
+
+    - ``churn/loss``: the churn loss L_churn, the mean squared change of all action values
     - ``churn/coef``: the λ it was multiplied by
-    - ``churn/relative_loss``: λ·L_churn / L, where L is the TD loss. The mean of the ratios of single updates lies above the
-      ratio of the means, which an adaptive λ holds at β
+    - ``churn/relative_loss``: λ·L_churn / L, where L is the TD loss. The mean of these ratios is greater than the ratio of the
+      means, which an adaptive λ holds at β
     - ``churn/value_churn``: mean absolute change of the action values by an update
     - ``churn/greedy_action_changes``: share of the states whose greedy action an update changed
 
-    :param model: A DQN model
-    :param reducer: Its churn reducer
-    :param batch_size: Size of the reference batches
+    :param logger: The model's logger
+    :param coef: λ
+    :param churn_loss: L_churn
+    :param td_loss: L
+    :param old: Action values of the reference batch before an update, ``(batch_size, n_actions)``
+    :param new: Action values of the same batch after it
     """
-    reducer.discard_losses()  # of an update that was interrupted
-    coef = reducer.coefficient.value
-
-    def sample() -> Observations:
-        assert model.replay_buffer is not None
-        return model.replay_buffer.sample(batch_size, env=model._vec_normalize_env).observations
-
-    if has_training_mode(model.policy):
-        seam = _own_pass(model, reducer, sample)
-    else:
-        seam = _joint_passes(model, reducer, sample)
-    with seam:
-        yield
-
-    if reducer.losses:
-        base_loss = float(model.logger.name_to_value["train/loss"])
-        churn_loss = sum(reducer.losses) / len(reducer.losses)
-        old, new = (th.cat(outputs) for outputs in zip(*reducer.compared, strict=True))
-        model.logger.record_mean("churn/loss", churn_loss)
-        model.logger.record_mean("churn/coef", coef)
-        model.logger.record_mean("churn/relative_loss", coef * churn_loss / (base_loss + 1e-8))
-        model.logger.record_mean("churn/value_churn", mean_absolute_change(old, new))
-        model.logger.record_mean("churn/greedy_action_changes", action_changes(old.argmax(dim=1), new.argmax(dim=1)))
-        reducer.end_iteration(base_loss)
+    logger.record_mean("churn/loss", churn_loss)
+    logger.record_mean("churn/coef", coef)
+    logger.record_mean("churn/relative_loss", coef * churn_loss / (td_loss + 1e-8))
+    logger.record_mean("churn/value_churn", mean_absolute_change(old, new))
+    logger.record_mean("churn/greedy_action_changes", action_changes(old.argmax(dim=1), new.argmax(dim=1)))
 
 
-@contextmanager
-def _own_pass(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations]) -> Iterator[None]:
-    """A forward and a backward pass for the reference batch, in which the network acts as it does in the environment."""
-
-    def backward() -> None:
-        reference = sample()
-        with as_it_acts(model.policy):
-            reducer.backward(reference)
-
-    with extra_gradient(model.policy.optimizer, backward):
-        yield
-
-
-@contextmanager
-def _joint_passes(model: DQN, reducer: ChurnReducer, sample: Callable[[], Observations]) -> Iterator[None]:
+def finite_td_loss(loss: th.Tensor, replay_data: ReplayBufferSamples) -> float:
     """
-    The same gradient, up to rounding, in no pass more than Double DQN makes: reference batches go through the network
-    together with the minibatch and its next observations, and the churn loss's gradient with respect to the outputs is
-    added where SB3's backward pass comes by. (Without Double Q-learning the next observations do not go through the network;
-    the old outputs then take a pass without gradient.)
+    :param loss: The mean loss of the TD errors
+    :param replay_data: The minibatch that it was computed on
+    :return: Its value
+    :raises ValueError: When it is NaN or infinite, naming what made it so
     """
-    q_net = model.q_net
-    upcoming: tuple[Observations, th.Tensor | None] | None = None  # the next reference batch, and the outputs on it
-
-    def joint_q_net(observations: Observations) -> th.Tensor:
-        """Called, with Double Q-learning, for the next observations without gradient; then for the observations."""
-        nonlocal upcoming
-        if not th.is_grad_enabled():
-            reference = sample()
-            q_values, outputs = _split(q_net(_cat(observations, reference)), observations)
-            upcoming = reference, outputs
-            return q_values
-
-        if reducer.reference is None:
-            q_values = q_net(observations)
-        else:
-            both = q_net(_cat(observations, reducer.reference))
-            q_values, outputs = _split(both, observations)
-            outputs = outputs.detach().requires_grad_()
-            (gradient,) = th.autograd.grad(reducer.loss(outputs), outputs)
-            both.register_hook(lambda of_both: th.cat([of_both[: -len(gradient)], gradient]))
-        reducer.remember(*(upcoming or (sample(), None)))
-        upcoming = None
-        return q_values
-
-    with replaced(model, "q_net", joint_q_net):
-        yield
+    value = loss.item()
+    if math.isfinite(value):
+        return value
+    raise ValueError(f"The TD loss is {value}: {_cause(replay_data)} The parameters have not been updated.")
 
 
-def _cat(minibatch: Observations, reference: Observations) -> Observations:
-    if isinstance(minibatch, dict) and isinstance(reference, dict):
-        return {key: th.cat([minibatch[key], reference[key]]) for key in minibatch}
-    assert th.is_tensor(minibatch) and th.is_tensor(reference)
-    return th.cat([minibatch, reference])
-
-
-def _split(outputs: th.Tensor, minibatch: Observations) -> tuple[th.Tensor, th.Tensor]:
-    size = n_observations(minibatch)
-    return outputs[:size], outputs[size:]
+def _cause(replay_data: ReplayBufferSamples) -> str:
+    for name, data in (
+        ("rewards", replay_data.rewards),
+        ("observations", replay_data.observations),
+        ("next observations", replay_data.next_observations),
+    ):
+        for tensor in data.values() if isinstance(data, dict) else [data]:
+            wrong = tensor[~tensor.isfinite()]
+            if len(wrong):
+                return (
+                    f"the {name} of the minibatch hold {wrong[0].item()}. Mend the environment, or clip what it returns; "
+                    "the replay buffer holds the faulty transition."
+                )
+    return (
+        "the network's action values are too large or NaN, while the observations and rewards of the minibatch are finite "
+        f"(the largest reward is {replay_data.rewards.abs().max().item():g} in absolute value). Scale the rewards, lower the "
+        "learning rate or set `max_grad_norm`."
+    )
