@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.cli
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
@@ -195,6 +196,28 @@ def test_errors(tmp_path, monkeypatch, capsys):
     model = make(DQN)
     with pytest.raises(ValueError, match=r"`n_updates` must be .* got 0"):
         inspect_model(model, n_updates=0)
+
+
+def test_models_that_cannot_be_inspected():
+    with pytest.raises(TypeError, match=r"DQN and QRDQN can be inspected, got one of SAC\. For others, give ChurnMonitor"):
+        inspect_model(make(SAC, "Pendulum-v1"))
+    without_env = make(PPO)
+    without_env.env = None
+    with pytest.raises(ValueError, match=r"has no environment: load it with one, PPO\.load\(path, env\)"):
+        inspect_model(without_env)
+    for algorithm in (PPO, DQN):
+        for value in (np.nan, np.inf):
+            model = make(algorithm)
+            next(model.policy.parameters()).data[0, 0] = value
+            with pytest.raises(ValueError, match=r"its parameter .*\.weight has entries that are infinite or not a number"):
+                inspect_model(model)
+
+
+@pytest.mark.parametrize("data", [None, {}, {"policy_class": "PPO"}])
+def test_files_that_hold_no_model(data, tmp_path):
+    save_to_zip_file(tmp_path / "model.zip", data=data)
+    with pytest.raises(ValueError, match=r"model\.zip is no model that Stable-Baselines3 has saved"):
+        algorithm_of(tmp_path / "model.zip")
 
 
 def test_schedules_stay_where_they_were(tmp_path, monkeypatch, capsys):

@@ -1,31 +1,35 @@
-"""The baselines that act by callbacks and networks, all at once, with each algorithm; and all baselines with C-CHAIN."""
+"""All methods that are callbacks and networks at once, with each algorithm; and all methods with C-CHAIN."""
 
 import pytest
 import torch as th
 from stable_baselines3 import DQN
 
 from sb3_cchain import TaskSync
-from sb3_cchain.methods import (
-    TRAC,
-    AdamRel,
-    L2Init,
-    OptimizerMetrics,
-    Oracle,
-    ReDo,
-    ShrinkAndPerturb,
-    WeightClipping,
-)
+from sb3_cchain.methods import AdamRel, OptimizerMetrics, Oracle, ReDo, ShrinkAndPerturb
 from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
-from tests.method_models import ALGORITHMS, STEPS_PER_TASK, go_on, make_env, make_model, make_random_env, parameters
-
-NESTED = dict(
-    optimizer_class=TRAC,
-    optimizer_kwargs=dict(s_init=0.1, base_class=L2Init, base_kwargs=dict(coef=0.1, base_class=WeightClipping)),
+from tests.method_models import (
+    ALGORITHMS,
+    CALLBACKS,
+    OPTIMIZERS,
+    STEPS_PER_TASK,
+    go_on,
+    make_callback,
+    make_env,
+    make_model,
+    make_random_env,
+    nested_optimizers,
+    parameters,
 )
 
 
+# AdamRel changes the optimiser, and is tested with the others below
 def callbacks():
-    return [TaskSync(), Oracle(), ReDo(tau=0.3, interval=1), ShrinkAndPerturb(shrink=0.999, interval=2)]
+    return [TaskSync(), *(make_callback(cls) for cls in CALLBACKS if cls is not AdamRel)]
+
+
+def find(cls, callbacks):
+    (callback,) = (callback for callback in callbacks if isinstance(callback, cls))
+    return callback
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -34,8 +38,9 @@ def test_train_save_load_and_go_on(tmp_path, name):
     model = make_model(name, policy=policy, policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU))
     first = callbacks()
     model.learn(STEPS_PER_TASK + 16, callback=first).save(tmp_path / "model")
-    _, oracle, redo, shrink = first
-    assert oracle.n_resets == 1 and redo.n_recycled > 0 and shrink.n_steps > 0
+    assert find(Oracle, first).n_resets == 1
+    assert find(ReDo, first).n_recycled > 0
+    assert find(ShrinkAndPerturb, first).n_steps > 0
 
     loaded = type(model).load(tmp_path / "model", env=make_env(), device="cpu")
     assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
@@ -47,7 +52,7 @@ def test_train_save_load_and_go_on(tmp_path, name):
     if isinstance(loaded, DQN):
         loaded.learning_starts = loaded.num_timesteps + 4
     loaded.learn(STEPS_PER_TASK, callback=second, reset_num_timesteps=False)
-    assert second[1].n_resets == 1
+    assert find(Oracle, second).n_resets == 1
     assert all(not th.equal(tensor, before[name]) for name, tensor in parameters(loaded).items() if "target" not in name)
     loaded.set_parameters(model.get_parameters())
     assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
@@ -66,19 +71,22 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
 
     def callbacks():
         redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
-        return [redo, ShrinkAndPerturb(shrink=0.999), AdamRel(), OptimizerMetrics()] if everything else [redo]
+        # The environment is not continual, so Oracle has nothing to do
+        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle)]
+        return [redo, *others, OptimizerMetrics()] if everything else [redo]
 
     layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
     model = make_model(
         name,
         env=make_random_env(),
         policy=layer_norm if everything else "MlpPolicy",
-        policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU, **(NESTED if everything else {})),
+        policy_kwargs=dict(net_arch=[16, 16], activation_fn=th.nn.ReLU, **(nested_optimizers() if everything else {})),
     )
     model.learn(48, callback=(first := callbacks()), log_interval=1000)
     assert first[0].n_recycled > 0
     keys = {"redo/n_recycled", "churn/loss"}
     if everything:
+        assert OPTIMIZERS.keys() <= {key.split("/")[0] for key in model.logger.name_to_value}
         keys |= {"trac/scale", "l2_init/distance", "weight_clipping/share", "adam_rel/n_resets", "shrink_and_perturb/n_steps"}
     assert keys <= set(model.logger.name_to_value)
 

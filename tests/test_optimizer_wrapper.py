@@ -1,4 +1,4 @@
-"""Optimisers around optimisers: one optimiser to whoever uses them."""
+"""Optimisers around optimisers can be used as one optimiser."""
 
 import copy
 import pickle
@@ -8,15 +8,23 @@ import torch as th
 from torch import nn
 
 from sb3_cchain.methods import TRAC, L2Init, OptimizerWrapper, Parseval, WeightClipping
+from tests.method_models import OPTIMIZERS, optimizer_arguments
 
 ADAM = dict(base_kwargs=dict(eps=1e-5))
 CLIPPED = dict(base_class=WeightClipping, base_kwargs=dict(clip_ratio=0.8, **ADAM))
+# Where the arguments of the registry's test models do not fit this network
+ARGUMENTS = {
+    "trac": dict(s_init=1e-2),
+    "weight_clipping": dict(clip_ratio=0.8),
+    "l2_init": dict(coef=0.3),
+    "parseval": dict(n_output_layers=1, coef=0.1),
+}
 WRAPPERS = {
-    "trac": (TRAC, dict(s_init=1e-2, **ADAM)),
-    "weight_clipping": (WeightClipping, dict(clip_ratio=0.8, **ADAM)),
-    "l2_init": (L2Init, dict(coef=0.3, **ADAM)),
+    **{
+        name: (row.optimizer_class, {**optimizer_arguments(row), **ARGUMENTS.get(name, {}), **ADAM})
+        for name, row in OPTIMIZERS.items()
+    },
     "l2": (L2Init, dict(coef=0.3, towards="zero", **ADAM)),
-    "parseval": (Parseval, dict(n_output_layers=1, coef=0.1, **ADAM)),
     "nested": (
         L2Init,
         dict(
@@ -242,6 +250,10 @@ def test_refuses():
     parameters = list(make_network().parameters())
     with pytest.raises(TypeError, match="`base_class` must be a class of optimisers, got 'Adam'"):
         TRAC(parameters, base_class="Adam")
+    with pytest.raises(TypeError, match=r"`base_class` must not need a closure, .* got LBFGS"):
+        TRAC(parameters, base_class=th.optim.LBFGS)
+    with pytest.raises(TypeError, match=r"`base_kwargs` must be a dictionary, got \[1e-05\]"):
+        TRAC(parameters, base_kwargs=[1e-5])
     with pytest.raises(ValueError, match="`base_class` must not contain another TRAC, got WeightClipping"):
         TRAC(parameters, base_class=WeightClipping, base_kwargs=dict(base_class=TRAC))
     for cls, argument in [

@@ -1,5 +1,6 @@
 """Churn, the neural tangent kernel and the health of the networks of a model, after the fact."""
 
+import inspect
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,10 +82,13 @@ def inspect_model(
     :param n_updates: Gradient updates, for off-policy algorithms
     :param callbacks: Those that it was trained with, as far as training depends on them
     :return: What was found
-    :raises ValueError: Naming the argument that is out of its range
+    :raises TypeError: For other algorithms
+    :raises ValueError: Naming the argument that is out of its range; for a model without an environment, or with parameters
+        that are not finite
     """
     check_number("n_steps", n_steps, 1, integer=True)
     check_number("n_updates", n_updates, 1, integer=True)
+    _check_model(model)
     model.set_logger(Logger(folder=None, output_formats=[]))
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
@@ -127,15 +131,33 @@ def inspect_model(
     return Inspection(name, figures, ntk.matrix, parameters)
 
 
+def _check_model(model: BaseAlgorithm) -> None:
+    is_known = isinstance(model, (OnPolicyAlgorithm, DQN)) or hasattr(model, "quantile_net")
+    if not is_known or hasattr(model, "_last_lstm_states"):
+        raise TypeError(
+            "Models of on-policy algorithms without recurrent networks, DQN and QRDQN can be inspected, got one of "
+            f"{type(model).__name__}. For others, give ChurnMonitor and NetworkHealth to learn()"
+        )
+    if model.env is None:
+        name = type(model).__name__
+        raise ValueError(
+            f"The model has no environment: load it with one, {name}.load(path, env), or give it one by set_env(env)"
+        )
+    for name, parameter in model.policy.named_parameters():
+        if not parameter.isfinite().all():
+            raise ValueError(f"The model cannot act: its parameter {name} has entries that are infinite or not a number")
+
+
 def algorithm_of(path: str | Path) -> type[BaseAlgorithm]:
     """
     :param path: A model that was saved by PPO, DQN or one of ours
     :return: The algorithm's class, which SB3 does not save; told by what it saves
-    :raises ValueError: When it is of another algorithm
+    :raises ValueError: When it is of another algorithm, or no model
     """
     data, *_ = load_from_zip_file(path, device="cpu")
-    assert data is not None
-    policy_class = data["policy_class"]
+    policy_class = (data or {}).get("policy_class")
+    if data is None or not inspect.isclass(policy_class):
+        raise ValueError(f"{path} is no model that Stable-Baselines3 has saved: it does not name its policy")
     if policy_class.__module__.startswith("sb3_contrib"):
         pass  # RecurrentPPO's policy is an ActorCriticPolicy
     elif issubclass(policy_class, DQNPolicy):

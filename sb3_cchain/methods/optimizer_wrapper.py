@@ -1,6 +1,8 @@
 """An optimiser around another one."""
 
+import inspect
 from collections.abc import Callable
+from types import NoneType
 from typing import Any, ClassVar
 
 import torch as th
@@ -29,7 +31,7 @@ class OptimizerWrapper(th.optim.Optimizer):
     :param base_class: Class of the optimiser inside, which may be another wrapper. It must not need a closure (as LBFGS does).
     :param base_kwargs: Its keyword arguments, learning rate excluded. SB3 gives ``eps=1e-5`` to a plain Adam in actor-critic
         policies, but to no other class: for the same, set ``base_kwargs=dict(eps=1e-5)``.
-    :raises TypeError: When ``base_class`` is no optimiser class
+    :raises TypeError: When ``base_class`` is no optimiser class, or one that needs a closure
     :raises ValueError: When a wrapper is nested in another one of its kind
     """
 
@@ -46,6 +48,12 @@ class OptimizerWrapper(th.optim.Optimizer):
     ):
         if not (isinstance(base_class, type) and issubclass(base_class, th.optim.Optimizer)):
             raise TypeError(f"`base_class` must be a class of optimisers, got {base_class!r}")
+        if inspect.signature(base_class.step).parameters["closure"].default is inspect.Parameter.empty:
+            raise TypeError(
+                f"`base_class` must not need a closure, which Stable-Baselines3 does not give, got {base_class.__name__}"
+            )
+        if not isinstance(base_kwargs, (dict, NoneType)):
+            raise TypeError(f"`base_kwargs` must be a dictionary, got {base_kwargs!r}")
         self.base: th.optim.Optimizer = base_class(params, lr=lr, **(base_kwargs or {}))  # type: ignore[call-arg]
         inner = self.base
         while isinstance(inner, OptimizerWrapper):

@@ -149,8 +149,11 @@ def find_method(name: str, suite: str) -> Method:
     :param name: Name of a method
     :param suite: Name of a suite
     :return: The row of the method for that suite's algorithm
-    :raises ValueError: When the method has no row for it
+    :raises ValueError: When no row names the suite, or the method has no row for its algorithm
     """
+    suites = {suite for method in REGISTRY for suite in method.suites}
+    if suite not in suites:
+        raise ValueError(f"`suite` must be one of {sorted(suites)}, got {suite!r}")
     vanilla = next(method for method in REGISTRY if method.name == "vanilla" and suite in method.suites)
     for method in REGISTRY:
         if method.name == name and (suite in method.suites or issubclass(method.algorithm, vanilla.algorithm)):

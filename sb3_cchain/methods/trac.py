@@ -36,7 +36,7 @@ class TRAC(OptimizerWrapper):
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate of the base
-    :param betas: Discounts, a tuner for each
+    :param betas: Discounts, one or more, with a tuner for each
     :param s_init: s₀, the scale to start from
     :param eps: ε
     :param kwargs: ``base_class`` and ``base_kwargs``, as for :class:`~sb3_cchain.methods.OptimizerWrapper`
@@ -57,6 +57,8 @@ class TRAC(OptimizerWrapper):
         **kwargs: Any,
     ):
         self.betas = check_list("betas", betas, of="numbers")
+        if not self.betas:
+            raise ValueError("`betas` must be one discount or more, got an empty list")
         for beta in self.betas:
             check_number("betas", beta, minimum=0, maximum=1)
         check_number("s_init", s_init, minimum=0, exclusive=True)
