@@ -22,9 +22,11 @@ from tensorboard.plugins.scalar.scalars_plugin import ScalarsPlugin
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualEnv, ContinualMetrics, TaskSync, TensorBoardOverview
 from sb3_cchain.methods import ReDo
+from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.tensorboard.hyperparameters import hyperparameters
-from sb3_cchain.tensorboard.layout import LAYOUT, layout_of
+from sb3_cchain.tensorboard.layout import LAYOUT, add_charts, layout_of
 from tests.envs import CountEnv, RandomEnv
+from tests.method_models import make_method
 
 SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=2, seed=0, device="cpu", policy_kwargs=dict(net_arch=[8]))
 RETURNS = list(LAYOUT["Returns"])
@@ -115,6 +117,31 @@ def test_dqn_in_an_environment_that_is_not_continual(tmp_path):
     assert board.hparams("CChainDQN_1")["algorithm"] == "CChainDQN"
 
 
+def logged_by_methods():
+    for method in REGISTRY:
+        model, callbacks = make_method(method)
+        model.learn(48, callback=callbacks, log_interval=1000)
+        yield from (tag for tag in model.logger.name_to_value if not tag.startswith(("rollout/", "time/", "train/", "churn/")))
+
+
+METHOD_TAGS = {"trac/scale", "l2_init/distance", "l2_init/loss", "parseval/loss", "weight_clipping/share", "redo/n_recycled"}
+METHOD_TAGS |= {"redo/dormant_share", "oracle/n_resets", "adam_rel/n_resets", "shrink_and_perturb/n_steps"}
+
+
+def test_each_tag_of_a_method_has_one_chart():
+    tags = set(logged_by_methods())
+    assert tags >= METHOD_TAGS
+    for tag in tags - {"continual/n_switches"}:
+        assert sum(map(len, layout_of({tag}).values())) == 1, f"{tag} has no chart, or several: see add_charts"
+
+
+def test_charts_can_be_added(monkeypatch):
+    monkeypatch.setattr("sb3_cchain.tensorboard.layout.LAYOUT", {"Returns": {"Return": "a/return"}})
+    add_charts("Returns", {"Length": "a/length"})
+    add_charts("Mine", {"Any": "mine/.*"})
+    assert layout_of({"a/length", "mine/x"}) == {"Returns": {"Length": "a/length"}, "Mine": {"Any": "mine/.*"}}
+
+
 def test_each_tag_of_the_monitors_has_one_chart():
     names = ("dormant_share", "active_share", "feature_srank", "feature_effective_rank", "weight_norm", "distance_from_init")
     tags = {
@@ -125,9 +152,8 @@ def test_each_tag_of_the_monitors_has_one_chart():
             for batch in ("fixed", "fresh")
             for name in ("policy_churn", "value_churn", "greedy_action_changes")
         ),
-        *("redo/n_recycled", "redo/dormant_share", "redo/dormant_share/q_net.q_net.0", "trac/scale", "trac/scale_actor"),
-        *("l2_init/distance", "l2_init/loss", "parseval/loss_critic", "weight_clipping/share", "oracle/n_resets"),
-        *("adam_rel/n_resets", "shrink_and_perturb/n_steps"),
+        *("redo/dormant_share/q_net.q_net.0", "trac/scale_actor", "parseval/loss_critic"),
+        *METHOD_TAGS,
     }
     of_tags = [
         [title for charts in layout_of({tag}).values() for title in charts] for tag in sorted({*tags, "eval/mean_reward"})

@@ -7,8 +7,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tensorboard.layout import add_charts
 
 _NO_STEP_COUNT = "AdamRel needs an optimiser with a step count, as Adam has, got {}"
+
+add_charts("Related methods", {"AdamRel: resets": "adam_rel/n_resets"})
 
 
 class AdamRel(BaseCallback):

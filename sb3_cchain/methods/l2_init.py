@@ -6,6 +6,15 @@ import torch as th
 from torch.optim.optimizer import ParamsT
 
 from sb3_cchain.methods.penalty import Penalty
+from sb3_cchain.tensorboard.layout import add_charts
+
+add_charts(
+    "Related methods",
+    {
+        "L2 Init: penalty": "l2_init/loss(_.+)?",
+        "L2 Init: distance": "l2_init/distance(_.+)?",
+    },
+)
 
 
 class L2Init(Penalty):

@@ -7,6 +7,9 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tensorboard.layout import add_charts
+
+add_charts("Related methods", {"Oracle: resets": "oracle/n_resets"})
 
 
 class Oracle(TaskBoundary):

@@ -6,7 +6,10 @@ import torch as th
 from torch.optim.optimizer import ParamsT
 
 from sb3_cchain.methods.penalty import Penalty
+from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
+
+add_charts("Related methods", {"Parseval: penalty": "parseval/loss(_.+)?"})
 
 
 class Parseval(Penalty):

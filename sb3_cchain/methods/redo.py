@@ -16,7 +16,16 @@ from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units, hidden_activity
+from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
+
+add_charts(
+    "Related methods",
+    {
+        "ReDo: dormant units, share": "redo/dormant_share(/.+)?",
+        "ReDo: units recycled": "redo/n_recycled",
+    },
+)
 
 
 class ReDo(TrainingInterval):

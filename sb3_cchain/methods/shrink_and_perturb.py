@@ -6,7 +6,10 @@ from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
+
+add_charts("Related methods", {"Shrink and perturb: steps": "shrink_and_perturb/n_steps"})
 
 
 class ShrinkAndPerturb(TaskBoundary):

@@ -7,7 +7,10 @@ import torch as th
 from torch.optim.optimizer import ParamsT
 
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
+
+add_charts("Related methods", {"Weight clipping: entries at their bound, share": "weight_clipping/share(_.+)?"})
 
 
 class WeightClipping(OptimizerWrapper):

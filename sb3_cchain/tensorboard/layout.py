@@ -47,16 +47,19 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Distance from initialisation": "health/distance_from_init(/.+)?",
         "Norm of the gradient, after clipping": "health/gradient_norm(/.+)?",
     },
-    "Related methods": {
-        "TRAC: scale": "trac/scale(_.+)?",
-        "L2 Init: distance": "l2_init/distance(_.+)?",
-        "Penalties: loss": "(l2_init|parseval)/loss(_.+)?",
-        "Weight clipping: entries at their bound, share": "weight_clipping/share(_.+)?",
-        "ReDo: dormant units, share": "redo/dormant_share(/.+)?",
-        "ReDo: units recycled": "redo/n_recycled",
-        "Resets and perturbations": "(oracle|adam_rel)/n_resets|shrink_and_perturb/n_steps",
-    },
+    # Methods add theirs by `add_charts`
+    "Related methods": {},
 }
+
+
+def add_charts(category: str, charts: dict[str, str]) -> None:
+    """
+    Add charts to the layout, as each method does for what it logs.
+
+    :param category: Category, which may be new
+    :param charts: Title of the chart → regular expression of the tags in it, whole tags
+    """
+    LAYOUT.setdefault(category, {}).update(charts)
 
 
 class TensorBoardLayout(KVWriter):
