@@ -26,8 +26,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
 
     - the reference batch shares no sample with the minibatch whose update is measured, as the paper demands; the released
       code draws both independently;
-    - the loss that λ is measured by is the mean over an iteration's updates; in DeepMind Control the released code takes that
-      of the last minibatch, which is greater in absolute value;
+    - λ is adapted to the mean loss over an iteration's updates; in DeepMind Control the released code takes the loss of the
+      last minibatch, which is greater in absolute value;
     - the old outputs are computed before the update instead of by a copy of the network after it, with the same result.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -39,17 +39,18 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param target_churn_ratio: β, the size of λ·L_churn relative to that loss. ``"auto"`` is 1e4 for discrete actions
         (the paper takes the best of 1e3, 1e4 and 1e5) and 0.05 for continuous ones (the paper: 0.05 or 0.5).
     :param churn_warmup: Iterations (rollout and ``train()``) until λ adapts
-    :param churn_window: Iterations that the running means of both losses go over
+    :param churn_window: Iterations that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the released
-        code. C-CHAIN does not need to be told of a switch, hence not by default.
-    :param churn_base_loss: ``"actor"``, the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
-        or ``"surrogate"``, the former alone, as in its ProcGen
+        code. Off by default, because C-CHAIN does not need to be told of a switch.
+    :param churn_base_loss: ``"actor"`` for the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
+        ``"surrogate"`` for the clipped surrogate alone, as in its ProcGen
     :param churn_component: Which component of the churn gradient is used: ``"full"``, or, as the paper's ablation does
         (Section 5.2), only its ``"projection"`` on PPO's gradient of the actor's parameters or the ``"orthogonal"`` rest.
-        The gradient is clipped after it was added.
+        It is added before the gradient is clipped.
     :param kwargs: Further keyword arguments of PPO
-    :raises ValueError: Naming the churn argument that is out of its range
+    :raises ValueError: Naming the churn argument that is out of its range; during training, for NaN or infinite rewards,
+        observations and churn losses, before an update is made with them
     """
 
     def __init__(self, *args: Any, churn_base_loss: str = "actor", churn_component: str = "full", **kwargs: Any):
@@ -59,7 +60,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
         super().__init__(*args, **kwargs)
 
     def _make_churn_reducer(self) -> ChurnReducer:
-        check_choices(self.churn_base_loss, self.churn_component)  # given to load(), they come by here alone
+        check_choices(self.churn_base_loss, self.churn_component)  # load() does not give them to __init__()
         return make_policy_reducer(self, self._make_churn_coefficient)
 
     def train(self) -> None:
