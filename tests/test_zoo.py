@@ -196,7 +196,7 @@ def test_walker_with_normalisation_that_restarts(tmp_path, capsys):
 
 
 def test_a_method_by_either_command(tmp_path, capsys):
-    """Ours, its ``enjoy``, and the stock one."""
+    """Our ``train`` and ``enjoy``, and the stock ``train``."""
     arguments = ("--env", "Continual/Acrobot-v1", "-n", "1600", "--env-kwargs", "steps_per_task:800", "--seed", "1", *FAST)
     arguments += (*NO_EVALUATION, "-f", tmp_path / "logs", "-tb", tmp_path / "tb", "-params", "n_epochs:1")
     command("train", "--algo", "ppo_trac", *arguments)

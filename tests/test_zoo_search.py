@@ -6,7 +6,7 @@ import numpy as np
 import optuna
 import pytest
 from rl_zoo3 import ALGOS
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 
 import sb3_cchain.methods
 import sb3_cchain.zoo.cli as zoo
@@ -25,7 +25,10 @@ def read_report(folder):
     return [dict(zip(header, trial, strict=True)) for trial in trials]
 
 
-def test_beta_is_searched_for_ppo_cchain(tmp_path):
+def test_beta_is_searched_for_ppo_cchain(tmp_path, monkeypatch):
+    # RL Zoo's space for PPO has long rollouts and large networks
+    _, converter = search._SEARCH_SPACES[PPO]
+    monkeypatch.setitem(search._SEARCH_SPACES, PPO, (lambda *_: dict(n_steps=50, batch_size=25), converter))
     command(
         *("train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-n", "100", "-f", tmp_path, *FAST),
         *(*OPTIMIZE, "--n-trials", "2"),
