@@ -124,7 +124,7 @@ def test_what_the_commands_do_not_need():
 
 def test_a_task_without_an_agent():
     run = make_run("minatar", "Continual/MinAtar-v0", "cchain", 0, 3, 100, "test")
-    look = look_at_task(run, 1, n_episodes=300)
+    look = look_at_task(run, 1, n_episodes=150)
     assert look.frame.shape == (160, 160, 3)
     # Measured with MinAtar alone over 9000 episodes: 0.51 ± 0.01
     assert 0.35 < look.random_return < 0.75

@@ -607,6 +607,19 @@ DAMAGES = {
     "versions that are no texts": (lambda path: edit_json(path, versions={"torch": 2}), "`versions` must be"),
     "too few names of tasks": (lambda path: edit_json(path, task_names=["task 0"]), "`task_names` must be 2; got 1"),
     "names of tasks that are numbers": (lambda path: edit_json(path, task_names=[0, 1]), "`task_names` must be"),
+    "too many steps": (lambda path: edit_json(path, steps_per_task=10**400), "`steps_per_task` is out of range"),
+    "too many steps in returns": (
+        lambda path: (path / "returns.csv").write_text(f"timesteps,task_id,n_episodes,mean_return\n{10**30},0,1,1\n"),
+        "counts that are out of range",
+    ),
+    "a budget without a command": (
+        lambda path: (path / "run.json").write_text('{"budget": "smoke"}'),
+        "is not a result ('command')",
+    ),
+    "run.json that is a folder": (
+        lambda path: ((path / "run.json").unlink(), (path / "run.json").mkdir()),
+        "is not a result",
+    ),
     "an unknown field": (lambda path: edit_json(path, nonsense=1), "nonsense"),
     "an unknown environment": (
         lambda path: edit_json(path, env_id="Continual/Pendulum-v1"),

@@ -4,38 +4,51 @@ import os
 import subprocess
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeVar
 
 from rich.console import Console
 
 from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import Result, find_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import PROGRAM, Finished, Training, TrainingFailed
+from benchmarks.grid.training import Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure, View
 
 # How often a run that dies, by itself or with its machine, is started again
 RETRIES = 2
 
 
-class Backend(Protocol):
+SelfBackend = TypeVar("SelfBackend", bound="Backend")
+
+
+class Backend(ABC):
     """Where runs are executed. A context manager: at its end nothing of it is left running."""
 
+    def __enter__(self: SelfBackend) -> SelfBackend:
+        return self
+
+    @abstractmethod
+    def __exit__(self, *error: object) -> None: ...
+
+    @abstractmethod
     def slots(self) -> int:
         """
         :return: How many runs it can execute at a time now; at least one, which waits if need be
         """
 
+    @abstractmethod
     def start(self, run: Run, logs: Path) -> None:
         """
         :param run: Run to start
         :param logs: Folder of all logs, on the machine that the run is on
         """
 
+    @abstractmethod
     def wait(self, seconds: float) -> list[tuple[Run, Finished | Failure]]:
         """
         :param seconds: How long to wait at most, roughly
@@ -44,8 +57,9 @@ class Backend(Protocol):
 
     def progress(self) -> dict[Run, str]:
         """
-        :return: How far the running runs are, as far as that is known here
+        :return: How far each running run is, where that is known here
         """
+        return {}
 
 
 def complete(
@@ -114,17 +128,17 @@ def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2) -> list[Result
     return [result for run in dict.fromkeys(runs) if (result := find_result(run, output))]
 
 
-class LocalBackend:
+class LocalBackend(Backend):
     """
     Processes of this machine, children of this process that do not outlive it.
 
     :param n_jobs: Runs at a time, None for one per core
     :param gpus_per_run: GPUs of a run, e.g. 0.25; runs that have one train on it
-    :param program: The training command before its arguments
+    :param program: The training command before its arguments, by default ``sb3-cchain``
     :raises ValueError: For less than one run at a time, or fewer GPUs than a run needs
     """
 
-    def __init__(self, n_jobs: int | None = None, gpus_per_run: float = 0.0, program: Sequence[str] = PROGRAM):
+    def __init__(self, n_jobs: int | None = None, gpus_per_run: float = 0.0, program: Sequence[str] | None = None):
         if n_jobs is not None and n_jobs < 1:
             raise ValueError(f"`n_jobs` must be at least 1; got {n_jobs}")
         n_jobs = n_jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
@@ -138,24 +152,16 @@ class LocalBackend:
         self._running: dict[Run, tuple[Training, str]] = {}
         self._not_started: list[tuple[Run, Failure]] = []
 
-    def __enter__(self) -> "LocalBackend":
-        return self
-
     def __exit__(self, *error: object) -> None:
         for training, _ in self._running.values():
             training.kill()
 
     def slots(self) -> int:
-        """
-        :return: How many runs it can execute at a time
-        """
+        """See :class:`Backend`."""
         return self._n_slots
 
     def start(self, run: Run, logs: Path) -> None:
-        """
-        :param run: Run to start
-        :param logs: Folder of all logs
-        """
+        """See :class:`Backend`."""
         gpu = self._free[-1]
         device, environment = ("cuda", {"CUDA_VISIBLE_DEVICES": gpu}) if gpu else ("cpu", {})
         try:
@@ -166,10 +172,7 @@ class LocalBackend:
             self._running[run] = training, self._free.pop()
 
     def wait(self, seconds: float) -> list[tuple[Run, Finished | Failure]]:
-        """
-        :param seconds: How long to wait at most, roughly
-        :return: Runs that have ended, and how
-        """
+        """See :class:`Backend`."""
         ended: list[tuple[Run, Finished | Failure]] = [*self._not_started]
         self._not_started.clear()
         end = time.monotonic() + seconds
@@ -187,9 +190,7 @@ class LocalBackend:
         return ended
 
     def progress(self) -> dict[Run, str]:
-        """
-        :return: How far each run is
-        """
+        """See :class:`Backend`."""
         return {run: training.progress() for run, (training, _) in self._running.items()}
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.grid.executor import checkout_commit
+from benchmarks.grid.executor import Backend, checkout_commit
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import PROGRAM, Finished, Training, TrainingFailed
+from benchmarks.grid.training import Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure
 
 # Parts of the checkout that no run needs
@@ -30,7 +30,7 @@ def import_ray() -> Any:
     return ray
 
 
-class RayBackend:
+class RayBackend(Backend):
     """
     Joins a Ray cluster. Its nodes get this checkout and run in a copy of it, so all runs have the same code, and a node's own
     installation matters for the dependencies alone.
@@ -39,13 +39,13 @@ class RayBackend:
 
     :param address: Address of the cluster
     :param gpus_per_run: GPUs of a run; runs that have one train on it
-    :param program: The training command before its arguments
+    :param program: The training command before its arguments, by default ``sb3-cchain``
     :raises ImportError: When Ray is not installed
     :raises ConnectionError: When nothing answers at the address
     :raises ValueError: When there are fewer GPUs than a run needs
     """
 
-    def __init__(self, address: str, gpus_per_run: float = 0.0, program: Sequence[str] = PROGRAM):
+    def __init__(self, address: str, gpus_per_run: float = 0.0, program: Sequence[str] | None = None):
         self._ray = ray = import_ray()
         self._gpus_per_run, self.program = gpus_per_run, program
         self._git_commit = checkout_commit()
@@ -67,32 +67,21 @@ class RayBackend:
         options = dict(num_cpus=1, num_gpus=gpus_per_run, max_retries=0, scheduling_strategy="SPREAD")
         self._task = ray.remote(_train).options(**options)
 
-    def __enter__(self) -> "RayBackend":
-        return self
-
     def __exit__(self, *error: object) -> None:
         self._ray.shutdown()
 
     def slots(self) -> int:
-        """
-        :return: How many runs the cluster can execute at a time now
-        """
+        """See :class:`Backend`."""
         return count_slots(self._ray.cluster_resources(), self._gpus_per_run)
 
     def start(self, run: Run, logs: Path) -> None:
-        """
-        :param run: Run to start
-        :param logs: Folder of all logs, on the machine that the run is on
-        """
+        """See :class:`Backend`."""
         self._logs = logs.absolute()
         device = "cuda" if self._gpus_per_run > 0 else "cpu"
         self._running[self._task.remote(run, self._logs, device, self._git_commit, self.program)] = run
 
     def wait(self, seconds: float) -> list[tuple[Run, Finished | Failure]]:
-        """
-        :param seconds: How long to wait at most, roughly
-        :return: Runs that have ended, and how
-        """
+        """See :class:`Backend`."""
         if not self._running:
             return []
         ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=seconds)
@@ -105,14 +94,8 @@ class RayBackend:
                 ended.append((run, _failure(run, error, self._logs)))
         return ended
 
-    def progress(self) -> dict[Run, str]:
-        """
-        :return: Nothing: the logs are on the nodes
-        """
-        return {}
 
-
-def _train(run: Run, logs: Path, device: str, git_commit: str | None, program: Sequence[str]) -> Finished:
+def _train(run: Run, logs: Path, device: str, git_commit: str | None, program: Sequence[str] | None) -> Finished:
     """On a node: train to the end."""
     training = Training(run, logs, device, git_commit, program)
     try:

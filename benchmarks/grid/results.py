@@ -39,6 +39,9 @@ RENAMED = {
     "sb3_cchain.common.torch_layers.": "sb3_cchain.networks.",
 }
 
+# No run has so many steps, seeds or seconds
+LARGEST = 2**53
+
 # Environment steps and values of one run
 Series = tuple[np.ndarray, np.ndarray]
 
@@ -152,7 +155,7 @@ def read_result(path: Path) -> Result | None:
         _check(result)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, LookupError, RecursionError, OSError) as error:
         raise ValueError(f"{file} is not a result ({error}); delete its folder to repeat the run") from error
     return result
 
@@ -229,7 +232,7 @@ def _check(result: Result) -> None:
         if name != "path" and not _matches(getattr(result, name), hint):
             raise ValueError(f"`{name}` must be {getattr(hint, '__name__', hint)}; got {getattr(result, name)!r}")
     for name in ("seed", "n_tasks", "steps_per_task", "seconds"):
-        if not (0 if name == "seed" else 1e-9) <= getattr(result, name) < math.inf:
+        if not (0 if name == "seed" else 1e-9) <= getattr(result, name) < LARGEST:
             raise ValueError(f"`{name}` is out of range: {getattr(result, name)}")
     if len(result.task_names) != result.n_tasks:
         raise ValueError(f"`task_names` must be {result.n_tasks}; got {len(result.task_names)}")
@@ -261,7 +264,10 @@ def _read_rows(path: Path, columns: Sequence[str], types: Sequence[type]) -> lis
             raise ValueError(f"its first line must be {','.join(columns)}")
         if not text.endswith("\n"):
             raise ValueError("its last line is torn")
-        return [tuple(kind(cell) for kind, cell in zip(types, line, strict=True)) for line in lines[1:]]
+        rows = [tuple(kind(cell) for kind, cell in zip(types, line, strict=True)) for line in lines[1:]]
+        if any(isinstance(value, int) and not 0 <= value < LARGEST for row in rows for value in row):
+            raise ValueError("it has counts that are out of range")
+        return rows
     except (OSError, ValueError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ValueError(f"{path} is missing or damaged ({reason}); delete its folder to repeat the run") from error

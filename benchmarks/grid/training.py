@@ -25,8 +25,6 @@ from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 
 # Packages whose versions are recorded
 PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
-# The command `sb3-cchain`, whether or not it is on the path
-PROGRAM = (sys.executable, "-m", "sb3_cchain.zoo.cli")
 
 
 class TrainingFailed(RuntimeError):
@@ -62,7 +60,7 @@ class Training:
     :param logs: Folder of all logs
     :param device: PyTorch device
     :param git_commit: Commit to record
-    :param program: The command before its arguments
+    :param program: The command before its arguments, by default ``sb3-cchain`` of this Python
     :param environment: Environment variables to add
     """
 
@@ -72,7 +70,7 @@ class Training:
         logs: Path,
         device: str = "cpu",
         git_commit: str | None = None,
-        program: Sequence[str] = PROGRAM,
+        program: Sequence[str] | None = None,
         environment: dict[str, str] | None = None,
     ):
         self.run = run
@@ -90,6 +88,7 @@ class Training:
             # As many threads as --num-threads, for the libraries that read the environment too
             variables = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}
             child = [sys.executable, str(Path(__file__).with_name("child.py")), str(os.getpid())]
+            program = program or (sys.executable, "-m", "sb3_cchain.zoo.cli")
             self._process = subprocess.Popen(
                 [*child, *program, *arguments], stdout=log, stderr=subprocess.STDOUT, env=variables
             )
