@@ -216,7 +216,7 @@ def test_models_that_cannot_be_inspected():
 @pytest.mark.parametrize("data", [None, {}, {"policy_class": "PPO"}])
 def test_files_that_hold_no_model(data, tmp_path):
     save_to_zip_file(tmp_path / "model.zip", data=data)
-    with pytest.raises(ValueError, match=r"model\.zip is no model that Stable-Baselines3 has saved"):
+    with pytest.raises(ValueError, match=r"model\.zip is not a model saved by Stable-Baselines3"):
         algorithm_of(tmp_path / "model.zip")
 
 

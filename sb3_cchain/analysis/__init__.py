@@ -1,4 +1,4 @@
-"""What a person who suspects the loss of plasticity looks at: churn, the neural tangent kernel, the health of networks."""
+"""Measures to see a loss of plasticity by: churn, the neural tangent kernel, the health of networks."""
 
 from sb3_cchain.analysis.churn_monitor import ChurnMonitor
 from sb3_cchain.analysis.network_health import NetworkHealth

@@ -1,4 +1,4 @@
-"""How much the updates change the network's outputs where they were not meant to."""
+"""Logs how much updates change the network's outputs on data that they were not made for."""
 
 from collections import deque
 from typing import Any
@@ -10,8 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.metrics.churn import churn
-from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, find_outputs, model_outputs
+from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, churn, find_outputs, model_outputs
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
@@ -24,10 +23,10 @@ class ChurnMonitor(BaseCallback):
     r"""
     Logs churn: how far an update moves the outputs of the network,
     :math:`C_f(x, \theta, \Delta_\theta) = f_{\theta + \Delta_\theta}(x) - f_\theta(x)`, Tang et al. (ICML 2025),
-    https://arxiv.org/abs/2506.00592. For any algorithm of Stable-Baselines3 and sb3-contrib, with churn reduction and without,
-    to which it makes no difference: training is the same to the bit.
+    https://arxiv.org/abs/2506.00592. It works with any algorithm of Stable-Baselines3 and sb3-contrib, with churn
+    reduction and without. Training is the same to the bit with and without it.
 
-    Every ``interval`` gradient updates a window of ``n_updates`` of them is measured, on two reference batches:
+    Every ``interval`` gradient updates, a window of ``n_updates`` updates is measured on two reference batches:
 
     - ``fixed``: drawn once, when the first window begins, and kept with the model (``model.churn_monitor_batch``), so that
       training that is resumed goes on with the same one;
@@ -40,16 +39,16 @@ class ChurnMonitor(BaseCallback):
 
     - ``policy_churn``: :math:`KL(\pi_{old} \,\|\, \pi_{new})` of categorical policies, several sub-actions being summed; the
       mean squared difference of the action means of continuous ones (of SAC, TQC, CrossQ, TD3 and DDPG of the deterministic
-      actions, between -1 and 1). Not for DQN and QRDQN, whose policy is greedy, nor for ARS with discrete actions.
+      actions, between -1 and 1). Not for DQN and QRDQN, whose policy is greedy, and not for ARS with discrete actions.
     - ``value_churn``: mean absolute change of the state values (PPO, A2C, TRPO), of all action values (DQN, QRDQN), or of all
       critics' values of the batch's actions (SAC, TQC, CrossQ, TD3, DDPG). Not for ARS.
     - ``greedy_action_changes``: share of the states whose most probable or most valuable action, or any of its sub-actions,
       changed. Not for continuous actions.
 
-    An update begins with the step of the optimiser and ends when the next one begins or ``train()`` is over; with actor and
-    critic apart with the critic's step, and the actor's that follow it. ``train()`` is over when the next rollout starts: give
-    the monitor before callbacks that change the network then (ReDo, Oracle), or their change counts, too. A window of several
-    updates may span several calls of ``train()``, and what happens between these counts.
+    An update begins with the step of the optimiser and ends when the next one begins or ``train()`` is over. With separate
+    optimisers of actor and critic, it begins with the critic's step and includes the actor's step that follows. ``train()`` is
+    over when the next rollout starts. Put the monitor before callbacks that change the network then (ReDo, Oracle), or their
+    change counts too. A window of several updates may span several calls of ``train()``; what happens between them counts.
 
     TRPO, whose policy no optimiser changes, and ARS are measured once per iteration instead, over the whole of its training,
     whatever the interval; ARS on the last observations of its candidates.
@@ -85,7 +84,7 @@ class ChurnMonitor(BaseCallback):
         self.batch_size = batch_size
         # Windows go on in phase when `learn()` is called again
         self._n_updates_seen = 0
-        # Of the window that is open: by name the batch and the outputs at the beginning, and the updates to come
+        # The open window: each batch with its outputs at the beginning, by name, and the number of updates until it ends
         self._window: dict[str, tuple[Batch, ModelOutputs]] = {}
         self._n_missing = 0
         # On the model until the next rollout starts or ends
@@ -165,8 +164,8 @@ class ChurnMonitor(BaseCallback):
 def _leading_optimizer(model: BaseAlgorithm) -> th.optim.Optimizer | None:
     """
     :param model: A model
-    :return: The optimiser whose steps begin the updates: the critic's, where it has one of its own. None where the optimiser,
-        if any, does not make all of the changes.
+    :return: The optimiser whose steps begin the updates: the critic's, when actor and critic have separate ones. None when the
+        optimiser, if any, does not make all of the changes.
     """
     # By its name, as sb3-contrib need not be installed
     if any(base.__name__ == "TRPO" for base in type(model).__mro__):

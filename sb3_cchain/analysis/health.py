@@ -26,14 +26,14 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
     r"""
     A group of layers is what the first two parts of the modules' names have in common: ``mlp_extractor.policy_net``,
     ``features_extractor.cnn``, ``action_net``; ``q_net.q_net``; ``actor.latent_pi``, ``critic.qf0``. A parameter that belongs
-    to no layer, such as ``log_std``, is a group of its own. A network that policy and value share is one group; where they
+    to no layer, such as ``log_std``, forms its own group. A network that policy and value share is one group; where they
     have a features extractor each, SB3 calls the policy's ``features_extractor`` and the value's ``vf_features_extractor``.
     Only what an optimiser of the model trains is counted, so no target network.
 
-    Of the units behind each activation function on the way from the observations to the actions and values (a unit of a
-    convolution being a filter, as long as its output is not flattened). Activation functions are modules of PyTorch's usual
-    kinds (``networks/activations.py``); what a network computes by functions, such as ``torch.relu``, is not seen, nor is a
-    network without any:
+    Figures of the units behind each activation function on the way from the observations to the actions and values. (A unit of
+    a convolution is a filter, as long as its output is not flattened.) Activation functions are modules of PyTorch's usual
+    kinds (``networks/activations.py``). Functions such as ``torch.relu`` are not seen, and networks without activation modules
+    have none of these figures:
 
     - ``dormant_share``: share of the units whose score :math:`s_i = E_x|h_i(x)| / \frac{1}{H} \sum_k E_x|h_k(x)|` among the H
       of their layer is at most τ (:func:`~sb3_cchain.analysis.metrics.dormancy.dormant_scores`; Sokar et al., ICML 2023,
@@ -44,8 +44,8 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
 
     A unit of CReLU has a positive and a negative part, and :math:`h_i` is their sum.
 
-    Of the features of a group, the outputs :math:`\Phi` of its last activation function, ``(n_observations, n_features)``,
-    flattened where they have positions, neither centred nor normalised:
+    Figures of the features of a group, the outputs :math:`\Phi` of its last activation function, ``(n_observations,
+    n_features)``, flattened where they have positions, neither centred nor normalised:
 
     - ``feature_srank``: :func:`~sb3_cchain.analysis.metrics.rank.srank` of :math:`\Phi` with δ = 0.01 (Kumar et al.,
       ICLR 2021)
@@ -53,7 +53,7 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
 
     Neither can exceed the number of observations. They are not a number where the features are not finite.
 
-    Of the parameters θ, all of them, biases included:
+    Figures of all parameters θ, biases included:
 
     - ``weight_norm``: :math:`\|\theta\|_2`
     - ``distance_from_init``: :math:`\|\theta - \theta_0\|_2`, when the model knows its :math:`\theta_0`
@@ -63,8 +63,8 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
         observation as an episode's first.
     :param observations: Observations, as the policy gets them
     :param tau: τ
-    :return: Each of them under its name over all groups (the ranks apart, which belong to one matrix), and of each group it
-        exists for, as ``dormant_share/mlp_extractor.policy_net``. The policy is left in the mode that it was in.
+    :return: Each figure under its name over all groups, except for the ranks, which belong to one matrix; and for each group
+        that has it, as ``dormant_share/mlp_extractor.policy_net``. The policy keeps its training mode.
     """
     return {**_unit_health(model.policy, observations, tau), **_parameter_health(model)}
 
@@ -124,7 +124,7 @@ def _unit_health(policy: BasePolicy, observations: PyTorchObs, tau: float) -> di
             dormant.setdefault(group, []).append(dormant_scores(mean_activity(units)) <= tau)
             if isinstance(module, (*RECTIFIERS, CReLU)):
                 active.setdefault(group, []).append(units > 0)
-            features[group] = output.flatten(start_dim=1)  # and so the last
+            features[group] = output.flatten(start_dim=1)  # the last one stays
     health = {**_shares("dormant_share", dormant), **_shares("active_share", active)}
     for group, matrix in features.items():
         sigma = singular_values(matrix) if matrix.isfinite().all() else None
@@ -134,7 +134,7 @@ def _unit_health(policy: BasePolicy, observations: PyTorchObs, tau: float) -> di
 
 
 def _shares(name: str, flags: dict[str, list[th.Tensor]]) -> dict[str, float]:
-    """Of what is true among all flags and among those of each group."""
+    """The share of flags that are true, among all and in each group."""
     counts = {group: (sum(int(f.sum()) for f in layers), sum(f.numel() for f in layers)) for group, layers in flags.items()}
     if not counts:
         return {}
@@ -170,7 +170,7 @@ def _activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Ten
 
 
 def _act(policy: Any, observations: PyTorchObs) -> Any:
-    """All that an actor-critic policy computes in one pass, with its values; of others, what their actions take."""
+    """Run the policy; the forward pass of an actor-critic policy includes its values."""
     if not hasattr(policy, "lstm_actor"):
         return policy(observations, deterministic=True)
     memory = empty_memory(policy, observations)

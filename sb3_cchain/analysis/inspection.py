@@ -46,7 +46,7 @@ _NEVER = 10**9
 @dataclass
 class Inspection:
     """
-    What was found.
+    The figures of one model.
 
     :param name: Name of the model
     :param figures: By name as in TensorBoard, and ``rollout/mean_return``, ``rollout/n_episodes``, ``rollout/n_steps``
@@ -68,9 +68,9 @@ def inspect_model(
     callbacks: Sequence[BaseCallback] = (),
 ) -> Inspection:
     """
-    Rolls the model out and trains it a little, as its training would go on, and looks at it with
+    Roll the model out and train it a little, as its training would go on, and look at it with
     :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` and
-    :class:`~sb3_cchain.analysis.NetworkHealth`. The model is not what it was afterwards.
+    :class:`~sb3_cchain.analysis.NetworkHealth`. This changes the model.
 
     On-policy, that is one iteration. Off-policy, ``n_steps`` steps fill a replay buffer, which is not saved with a model, and
     ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
@@ -80,7 +80,7 @@ def inspect_model(
     :param name: What it is called in reports
     :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
     :param n_updates: Gradient updates, for off-policy algorithms
-    :param callbacks: Those that it was trained with, as far as training depends on them
+    :param callbacks: Callbacks of its training on which the training depends
     :return: What was found
     :raises TypeError: For other algorithms
     :raises ValueError: Naming the argument that is out of its range; for a model without an environment, or with parameters
@@ -96,19 +96,19 @@ def inspect_model(
         model.learning_starts = 0
         model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         model.gradient_steps = n_updates
-    # Of this rollout, and of all of it
+    # All episodes of this rollout, and no others
     model.ep_info_buffer, model._stats_window_size = None, n_steps
     parameters = {
-        group: {name: parameter.detach().clone() for name, parameter in of_group.items()}
-        for group, of_group in trained_groups(model).items()
+        group: {name: parameter.detach().clone() for name, parameter in group_parameters.items()}
+        for group, group_parameters in trained_groups(model).items()
     }
     knows_its_start = hasattr(model, "initial_parameters")
     ntk, health = NTKCallback(interval=1, picture_interval=0), NetworkHealth(interval=1)
-    # What it was trained with looks at itself no more
+    # The monitors that it was trained with are replaced by those above
     others = [callback for callback in callbacks if not isinstance(callback, (ChurnMonitor, NTKCallback, NetworkHealth))]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
         others.insert(0, TaskSync())
-    # The schedules stay where they are, instead of going to their ends
+    # Schedules keep their present values instead of going to their ends
     with replaced(model, "_update_current_progress_remaining", lambda *_: None):
         model.learn(
             n_steps,
@@ -150,14 +150,14 @@ def _check_model(model: BaseAlgorithm) -> None:
 
 def algorithm_of(path: str | Path) -> type[BaseAlgorithm]:
     """
-    :param path: A model that was saved by PPO, DQN or one of ours
-    :return: The algorithm's class, which SB3 does not save; told by what it saves
+    :param path: A model that was saved by PPO, DQN, or an algorithm of this package
+    :return: The algorithm's class. SB3 does not save it, so it is told from the data that it saves.
     :raises ValueError: When it is of another algorithm, or no model
     """
     data, *_ = load_from_zip_file(path, device="cpu")
     policy_class = (data or {}).get("policy_class")
     if data is None or not inspect.isclass(policy_class):
-        raise ValueError(f"{path} is no model that Stable-Baselines3 has saved: it does not name its policy")
+        raise ValueError(f"{path} is not a model saved by Stable-Baselines3: it does not name its policy")
     if policy_class.__module__.startswith("sb3_contrib"):
         pass  # RecurrentPPO's policy is an ActorCriticPolicy
     elif issubclass(policy_class, DQNPolicy):
@@ -192,12 +192,12 @@ def report(inspections: Sequence[Inspection]) -> list[Table]:
 def _distances(a: Inspection, b: Inspection) -> Table:
     table = Table("", "L2 distance", title=f"From {a.name}'s parameters to {b.name}'s", title_justify="left", min_width=60)
     shapes_of_a, shapes_of_b = (
-        {group: [(name, p.shape) for name, p in of_group.items()] for group, of_group in inspection.parameters.items()}
+        {group: [(name, p.shape) for name, p in parameters.items()] for group, parameters in inspection.parameters.items()}
         for inspection in (a, b)
     )
     differences = {
-        group: [b.parameters[group][name] - parameter for name, parameter in of_group.items()]
-        for group, of_group in a.parameters.items()
+        group: [b.parameters[group][name] - parameter for name, parameter in parameters.items()]
+        for group, parameters in a.parameters.items()
         if shapes_of_a[group] == shapes_of_b.get(group)
     }
     for name, distance in group_norms("together", differences).items():

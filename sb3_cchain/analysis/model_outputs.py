@@ -1,4 +1,4 @@
-"""What the outputs of a Stable-Baselines3 model are, by kind of algorithm."""
+"""The outputs of any Stable-Baselines3 model, and how far they moved."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +10,9 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
+from sb3_cchain.analysis.metrics.churn import kl_divergence
 from sb3_cchain.analysis.reference_batch import Batch
+from sb3_cchain.churn.divergence import action_changes, mean_absolute_change, mean_squared_difference
 from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
 from sb3_cchain.networks.policy_outputs import distribution_outputs, policy_outputs, policy_values
 
@@ -18,7 +20,7 @@ from sb3_cchain.networks.policy_outputs import distribution_outputs, policy_outp
 @dataclass(frozen=True)
 class ModelOutputs:
     """
-    Outputs of a model on a batch, without gradient. None stands for what its algorithm has not.
+    Outputs of a model on a batch, without gradient; None for those that its algorithm does not have.
 
     :param probabilities: Of a categorical policy's actions, ``(batch_size, n_actions)``; with several sub-actions
         ``(batch_size, n_sub_actions, max_n)``, the shorter ones padded with 0
@@ -41,14 +43,40 @@ def model_outputs(model: BaseAlgorithm, batch: Batch) -> ModelOutputs:
     """
     :param model: A model of any algorithm of Stable-Baselines3 or sb3-contrib
     :param batch: ``observations``, as the networks get them; of off-policy algorithms the ``actions`` too, as in their replay
-        buffer; of MaskablePPO the ``action_masks``, if they shall apply. Recurrent networks take each observation as the first
-        of an episode.
+        buffer; of MaskablePPO the ``action_masks``, if they should apply. Recurrent networks take each observation as an
+        episode's first.
     :return: Its outputs, in evaluation mode
     :raises TypeError: For an algorithm that is not known here
     """
     outputs = find_outputs(model)
     with th.no_grad(), evaluation_mode(model.policy):
         return outputs(model.policy, batch)
+
+
+def churn(old: ModelOutputs, new: ModelOutputs) -> dict[str, float]:
+    r"""
+    The churn :math:`C_f(x, \theta, \Delta_\theta)` of Tang et al. (ICML 2025), https://arxiv.org/abs/2506.00592, averaged over
+    a batch, for each kind of output that the algorithm has:
+
+    - ``policy_churn``: of a categorical policy :func:`~sb3_cchain.analysis.metrics.churn.kl_divergence`; of a continuous one
+      the mean squared difference of the action means, over batch and action dimensions
+    - ``value_churn``: :func:`~sb3_cchain.churn.divergence.mean_absolute_change` of the values
+    - ``greedy_action_changes``: :func:`~sb3_cchain.churn.divergence.action_changes` of the greedy actions
+
+    :param old: Outputs before
+    :param new: Outputs after, on the same batch
+    :return: By name
+    """
+    churns = {}
+    if old.probabilities is not None and new.probabilities is not None:
+        churns["policy_churn"] = kl_divergence(old.probabilities, new.probabilities)
+    if old.action_means is not None and new.action_means is not None:
+        churns["policy_churn"] = mean_squared_difference(old.action_means, new.action_means).item()
+    if old.values is not None and new.values is not None:
+        churns["value_churn"] = mean_absolute_change(old.values, new.values)
+    if old.greedy_actions is not None and new.greedy_actions is not None:
+        churns["greedy_action_changes"] = action_changes(old.greedy_actions, new.greedy_actions)
+    return churns
 
 
 def find_outputs(model: BaseAlgorithm) -> Callable[[Any, Batch], ModelOutputs]:
@@ -63,7 +91,7 @@ def find_outputs(model: BaseAlgorithm) -> Callable[[Any, Batch], ModelOutputs]:
     raise TypeError(f"The outputs of {type(model).__name__} with {type(model.policy).__name__} are not known")
 
 
-def _of_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
+def _actor_critic_outputs(policy: Any, batch: Batch) -> ModelOutputs:
     observations = batch["observations"]
     if "action_masks" in batch:
         actions = distribution_outputs(policy.get_distribution(observations, batch["action_masks"]))
@@ -72,7 +100,7 @@ def _of_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
     return _with_actions(policy, actions, policy_values(policy, observations))
 
 
-def _of_recurrent_actor_critic(policy: Any, batch: Batch) -> ModelOutputs:
+def _recurrent_actor_critic_outputs(policy: Any, batch: Batch) -> ModelOutputs:
     observations = batch["observations"]
     episode_starts = th.zeros(n_observations(observations), device=policy.device)
     at_the_start = empty_memory(policy, observations), episode_starts
@@ -86,12 +114,12 @@ def _with_actions(policy: Any, actions: th.Tensor, values: th.Tensor) -> ModelOu
     return ModelOutputs(probabilities=actions, values=values, greedy_actions=actions.argmax(dim=-1))
 
 
-def _of_q_network(policy: Any, batch: Batch) -> ModelOutputs:
-    # The policy's: DQN's own attribute stands for something else while churn is reduced
+def _q_network_outputs(policy: Any, batch: Batch) -> ModelOutputs:
+    # Not `model.q_net`, which is replaced while churn is reduced
     return _with_greedy_actions(policy.q_net(batch["observations"]))
 
 
-def _of_quantile_network(policy: Any, batch: Batch) -> ModelOutputs:
+def _quantile_network_outputs(policy: Any, batch: Batch) -> ModelOutputs:
     return _with_greedy_actions(policy.quantile_net(batch["observations"]).mean(dim=1))
 
 
@@ -99,7 +127,7 @@ def _with_greedy_actions(q_values: th.Tensor) -> ModelOutputs:
     return ModelOutputs(values=q_values, greedy_actions=q_values.argmax(dim=1))
 
 
-def _of_actor_and_critics(policy: Any, batch: Batch) -> ModelOutputs:
+def _actor_and_critics_outputs(policy: Any, batch: Batch) -> ModelOutputs:
     observations = batch["observations"]
     values = policy.critic(observations, batch["actions"])
     # A tuple of (batch_size, 1), or with quantiles (batch_size, n_critics, n_quantiles)
@@ -107,21 +135,21 @@ def _of_actor_and_critics(policy: Any, batch: Batch) -> ModelOutputs:
     return ModelOutputs(action_means=policy._predict(observations, deterministic=True), values=values)
 
 
-def _of_actor(policy: Any, batch: Batch) -> ModelOutputs:
+def _actor_outputs(policy: Any, batch: Batch) -> ModelOutputs:
     actions = policy._predict(batch["observations"])
     if isinstance(policy.action_space, spaces.Box):
         return ModelOutputs(action_means=actions)
     return ModelOutputs(greedy_actions=actions)
 
 
-# By the attributes of the policy, as sb3-contrib need not be installed; the first that fits
+# By attributes of the policy, because sb3-contrib need not be installed. The first match counts.
 _KINDS: dict[tuple[str, ...], Callable[[Any, Batch], ModelOutputs]] = {
-    ("lstm_actor",): _of_recurrent_actor_critic,
-    ("predict_values",): _of_actor_critic,
-    ("q_net",): _of_q_network,
-    ("quantile_net",): _of_quantile_network,
-    ("actor", "critic"): _of_actor_and_critics,
-    ("action_net",): _of_actor,  # ARS
+    ("lstm_actor",): _recurrent_actor_critic_outputs,
+    ("predict_values",): _actor_critic_outputs,
+    ("q_net",): _q_network_outputs,
+    ("quantile_net",): _quantile_network_outputs,
+    ("actor", "critic"): _actor_and_critics_outputs,
+    ("action_net",): _actor_outputs,  # ARS
 }
 
 
@@ -130,7 +158,7 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
     """
     Running BatchNorm statistics and no dropout inside the ``with`` block.
 
-    :param network: A network, each of whose modules gets back the mode that it was in
+    :param network: A network; each of its modules gets its mode back afterwards
     """
     modes = [(module, module.training) for module in network.modules()]
     network.eval()

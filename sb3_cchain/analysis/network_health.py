@@ -15,7 +15,7 @@ from sb3_cchain.validation import check_number
 
 class NetworkHealth(TrainingInterval):
     r"""
-    Logs, under ``health/``, what is known to go along with the loss of plasticity. All formulas and sources are those of
+    Logs, under ``health/``, figures that are known to go along with the loss of plasticity. For formulas and sources see
     :func:`~sb3_cchain.analysis.health.network_health`, which computes
 
     - ``dormant_share``: share of the hidden units that are τ-dormant
@@ -32,8 +32,8 @@ class NetworkHealth(TrainingInterval):
       and other extra gradients, after clipping. Absent before ``learn()`` has made an update, and for TRPO's policy, which
       no optimiser steps.
 
-    Each is logged over the whole model (the ranks apart, which belong to one matrix), and as ``health/<name>/<group>`` of each
-    group of layers, such as ``mlp_extractor.policy_net`` (not in the table on the screen).
+    Each is logged over the whole model, except for the ranks, which belong to one matrix; and as ``health/<name>/<group>`` of
+    each group of layers, such as ``mlp_extractor.policy_net`` (not in the table on the screen).
 
     It acts at the end of the first rollout after which the model learns, before that update; then at the end of each rollout
     in which a multiple of ``interval`` was reached. The observations are of that rollout, or, off-policy, of the replay
@@ -97,7 +97,7 @@ class NetworkHealth(TrainingInterval):
             group: [self._gradient_norms[parameter] for parameter in parameters.values() if parameter in self._gradient_norms]
             for group, parameters in trained_groups(self.model).items()
         }
-        known = {group: of_group for group, of_group in norms.items() if of_group}
+        known = {group: latest for group, latest in norms.items() if latest}
         return group_norms("gradient_norm", known) if known else {}
 
     def _log(self) -> None:

@@ -22,16 +22,16 @@ def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
 
     .. math:: \frac{1}{|B_i|} \sum_{(s, a) \in B_i} \frac{\pi_\theta(a|s)}{\pi_{old}(a|s)} \hat A(s, a),
 
-    with respect to the policy's parameters. To be called when the rollout is complete and ``train()`` has not begun: θ are
-    the parameters that it was collected with, so nothing is clipped yet, the gradients of PPO, of its surrogate and of A2C are
-    the same, and it is computed as that of :math:`\log \pi_\theta(a|s)\, \hat A(s, a)`. There is no entropy bonus in it. The
-    advantages are normalised over the rollout to mean 0 and standard deviation 1, whatever the algorithm does: so their scale
-    is no part of what is compared between tasks.
+    with respect to the policy's parameters. Call it when the rollout is complete and ``train()`` has not begun: θ are then the
+    parameters that the rollout was collected with, so nothing is clipped yet, the gradients of PPO, of its surrogate and of
+    A2C are the same, and it is computed as that of :math:`\log \pi_\theta(a|s)\, \hat A(s, a)`. It has no entropy bonus. The
+    advantages are normalised over the rollout to mean 0 and standard deviation 1, for every algorithm, so that their scale
+    does not enter the comparison between tasks.
 
     The global NumPy generator draws the division.
 
     :param model: A model with a complete rollout
-    :param n_minibatches: m, the size of the matrix; it is the rollout's size where that is smaller
+    :param n_minibatches: m, the size of the matrix; limited by the size of the rollout
     :return: ``(m, m)``
     """
     buffer, policy = model.rollout_buffer, model.policy
@@ -42,11 +42,11 @@ def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
     def minibatches_of(array: Any) -> Any:
         """``(n_steps, n_envs, ...)`` to ``(n_minibatches, batch_size, ...)``"""
         if isinstance(array, dict):
-            return {key: minibatches_of(of_key) for key, of_key in array.items()}
+            return {key: minibatches_of(part) for key, part in array.items()}
         return obs_as_tensor(array[np.divmod(indices, buffer.n_envs)], model.device)
 
     advantages = minibatches_of((buffer.advantages - buffer.advantages.mean()) / (buffer.advantages.std() + 1e-8))
-    # As the buffer's own minibatches have them: those of MultiBinary are kept as integers
+    # As in the buffer's own minibatches; the buffer keeps MultiBinary actions as integers
     actions = minibatches_of(buffer.actions.astype(np.float32, copy=False))
     if isinstance(model.action_space, spaces.Discrete):
         actions = actions.long().flatten(start_dim=1)
@@ -68,7 +68,7 @@ def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
     :math:`N(i, j) = \nabla_\theta Q_\theta(s_i, a_i)^\top \nabla_\theta Q_\theta(s_j, a_j)`.
 
     :param model: A model whose replay buffer is not empty
-    :param n_transitions: m, the size of the matrix; it is the number of time steps in the buffer where that is smaller
+    :param n_transitions: m, the size of the matrix; limited by the number of time steps in the buffer
     :return: ``(m, m)``
     """
     assert model.replay_buffer is not None
@@ -100,7 +100,7 @@ def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
 def _ntk(network: nn.Module, objective: Objective, minibatches: Any) -> th.Tensor:
     # Vectorised convolutions take more memory and time than one minibatch after the other
     vectorize = not any(isinstance(module, nn.modules.conv._ConvNd) for module in network.modules())
-    # A policy keeps its last distribution, which shall not be one of vmap's tensors
+    # A policy keeps its last distribution, which must not consist of vmap's tensors
     distribution = getattr(network, "action_dist", None)
     before = dict(vars(distribution)) if distribution is not None else {}
     try:

@@ -10,8 +10,8 @@ import torch as th
 @contextmanager
 def unchanged_random_state() -> Iterator[None]:
     """
-    What is drawn inside the ``with`` block from the global generators, as replay buffers and networks draw, leaves no trace:
-    training goes on with the numbers that it would have drawn without it.
+    Random numbers that are drawn inside the ``with`` block from the global generators, as replay buffers and networks do,
+    leave no trace: training goes on with the numbers that it would have drawn without them.
     """
     numpy_state = np.random.get_state()
     devices = range(th.cuda.device_count()) if th.cuda.is_initialized() else []

@@ -1,4 +1,4 @@
-"""Data of the training under way, to look at a model on."""
+"""Batches of the data that a model is being trained on."""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,15 +9,15 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-# "observations", a tensor or a dict of them, and, where there are, "actions" and "action_masks"
+# "observations", a tensor or a dict of tensors; "actions" and "action_masks" for algorithms that have them
 Batch = dict[str, Any]
 
 
 def sample_batch(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: int) -> Batch:
     """
-    Observations as the networks get them. On-policy they are of the rollout, drawn without repetition and so no more than
-    there are, with the action masks of MaskablePPO; to be called between a rollout's end and the next one's start. Off-policy
-    they are of the replay buffer, with the actions.
+    Observations as the networks get them. On-policy they come from the rollout, without repetition, so there are at most as
+    many as in the rollout, with the action masks of MaskablePPO; call it between the end of a rollout and the start of the
+    next. Off-policy they come from the replay buffer, with the actions.
 
     :param model: A model
     :param batch_size: How many

@@ -1,4 +1,4 @@
-"""Acting every so much training, on data of that training."""
+"""Callbacks that act at intervals of the training, on its data."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -12,7 +12,7 @@ from sb3_cchain.validation import check_number
 
 class TrainingInterval(BaseCallback):
     """
-    Base of callbacks that act every ``interval``, and look at data of the training then.
+    Base of callbacks that act every ``interval`` and then look at data of the training.
 
     :param interval: Calls of ``train()`` for on-policy algorithms, gradient updates for off-policy ones; None for the
         defaults
@@ -29,7 +29,7 @@ class TrainingInterval(BaseCallback):
             check_number("interval", interval, 1, integer=True)
         self.interval = interval
         self._defaults = default_on_policy, default_off_policy
-        # Not begun anew when `learn()` is called again
+        # Goes on when `learn()` is called again
         self._has_looked = False
 
     def _on_training_start(self) -> None:
@@ -61,8 +61,8 @@ class TrainingInterval(BaseCallback):
 
     def _sample_observations(self, batch_size: int) -> PyTorchObs:
         """
-        Observations as the networks get them: on-policy of the rollout, without repetition and so no more than there are;
-        off-policy of the replay buffer. To be called between a rollout's end and ``train()``, which empties the former.
+        Observations as the networks get them: on-policy of the rollout, without repetition and at most as many as it has;
+        off-policy of the replay buffer. Call it between the end of a rollout and the start of the next.
         """
         observations: PyTorchObs = sample_batch(self.model, batch_size)["observations"]
         return observations

@@ -16,25 +16,25 @@ add_charts("Related methods", {"AdamRel: resets": "adam_rel/n_resets"})
 
 class AdamRel(BaseCallback):
     """
-    Adam with relative timesteps: Adam's step count t restarts whenever the objective changes, its moments go on. The first
-    update after that is
+    Adam with relative timesteps: Adam's step count t restarts whenever the objective changes, while its moments go on. The
+    first update after that is
 
     θ ← θ − η · m̂ / (√v̂ + ε) with m̂ = m / (1 − β₁), v̂ = v / (1 − β₂)
 
-    where m and v are the running moments, this update's gradient included.
+    where m and v are the running moments, which include the gradient of this update.
 
-    Paper: https://arxiv.org/abs/2412.17113 (Ellis et al., NeurIPS 2024). The objective changes, as there,
+    Paper: https://arxiv.org/abs/2412.17113 (Ellis et al., NeurIPS 2024). As in the paper, the objective changes
 
     - with on-policy algorithms at each rollout: the count is 0 when ``train()`` begins;
     - with DQN (and sb3-contrib's QR-DQN) when the target network was updated, every ``target_update_interval`` environment
       steps: the count is 0 at the first update after that.
 
-    It serves any optimiser with Adam's step count (Adam, AdamW, Adamax, RAdam, NAdam), also inside of wrappers. Given as a
-    callback, it needs no optimiser class of its own, and SB3's ``eps=1e-5`` for Adam stays.
+    It works with any optimiser that has Adam's step count (Adam, AdamW, Adamax, RAdam, NAdam), also inside wrappers. Because
+    it is a callback, SB3's ``eps=1e-5`` for Adam stays.
 
     Logged: ``adam_rel/n_resets``, how often the count was set to 0.
 
-    Costs next to nothing. It has no arguments, nor does the method.
+    It costs next to nothing. Neither the method nor the class has arguments.
 
     It raises a ``TypeError`` for other algorithms, and for optimisers without a step count.
     """
@@ -45,10 +45,10 @@ class AdamRel(BaseCallback):
 
     def _init_callback(self) -> None:
         model = self.model
-        if not (isinstance(model, OnPolicyAlgorithm) or hasattr(model, "_n_calls")):  # which DQN counts target updates by
+        if not (isinstance(model, OnPolicyAlgorithm) or hasattr(model, "_n_calls")):  # DQN counts target updates with it
             raise TypeError(f"AdamRel is for on-policy algorithms and DQN, got {type(model).__name__}")
         for optimizer in model_optimizers(model).values():
-            # RMSprop counts steps, too, but for nothing
+            # RMSprop counts steps too, but does not use the count
             if not all("betas" in group for group in optimizer.param_groups):
                 raise TypeError(_NO_STEP_COUNT.format(type(optimizer).__name__))
         self._n_target_updates = self._count_target_updates()
@@ -74,8 +74,8 @@ def reset_step_count(optimizer: th.optim.Optimizer) -> bool:
     Set Adam's step count to 0.
 
     :param optimizer: An optimiser
-    :return: Whether there was something to set, as there is once it has made an update
-    :raises TypeError: When it has made an update, and does not count them
+    :return: Whether there was something to set, which is so from its first update on
+    :raises TypeError: When it has made an update and does not count updates
     """
     states = [state for key, state in optimizer.state.items() if th.is_tensor(key)]
     for state in states:

@@ -1,4 +1,4 @@
-"""C-CHAIN beside other methods."""
+"""C-CHAIN together with other methods."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -9,9 +9,9 @@ from sb3_cchain.tasks.sync import iterate_callbacks
 def churn_reducers(callback: BaseCallback) -> list[ChurnReducer]:
     """
     :param callback: A callback, during ``learn()``
-    :return: What reduces churn in that training: of the model (``CChainPPO``, ``CChainDQN``), or of another callback
-        (``CChainCallback``). A method that changes the network between two updates makes it forget its reference batch: the
-        change is no churn, which is an update's, and shall not be undone.
+    :return: The churn reducers of that training: of the model (``CChainPPO``, ``CChainDQN``), or of another callback
+        (``CChainCallback``). A method that changes the network between two updates makes them forget their reference batch,
+        because only changes by updates are churn; otherwise C-CHAIN would undo the change.
     """
     holders = [callback.model, *iterate_callbacks(callback.locals.get("callback"))]
     return [holder.churn_reducer for holder in holders if hasattr(holder, "churn_reducer")]

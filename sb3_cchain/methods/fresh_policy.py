@@ -8,8 +8,8 @@ from stable_baselines3.common.policies import BasePolicy
 
 def fresh_policy(model: BaseAlgorithm) -> BasePolicy:
     """
-    The policy as it was made when training began, from other random numbers: those that PyTorch draws next. Whatever the
-    policy's initialisation is (orthogonal, Xavier, PyTorch's), so is this one's.
+    The policy as it was made when training began, but from other random numbers: those that PyTorch draws next. It has the
+    same kind of initialisation as the policy (orthogonal, Xavier, PyTorch's).
 
     :param model: A model
     :return: A policy of the same class and arguments, on the same device, with an optimiser of its own
@@ -25,7 +25,7 @@ def fresh_policy(model: BaseAlgorithm) -> BasePolicy:
 def require_policy_optimizer(callback: BaseCallback) -> None:
     """
     :param callback: A callback of a model
-    :raises TypeError: When the model has no optimiser of all its parameters, as actor-critic methods with several have not
+    :raises TypeError: When the model has several optimisers, as SAC and TD3 have
     """
     if not hasattr(callback.model.policy, "optimizer"):
         name, algorithm = type(callback).__name__, type(callback.model).__name__

@@ -15,10 +15,10 @@ from sb3_cchain.networks.forward_hooks import forward_hooks
 @dataclass
 class HiddenUnits:
     """
-    The units (filters, for a convolution) of a hidden layer all of whose outgoing weights are known.
+    The units of a hidden layer, for a convolution its filters. All of their outgoing weights are known.
 
-    Modules are named as in ``network.named_modules()``. A *source* says of each input channel of a module which unit of the
-    layer it is, or -1.
+    Modules are named as in ``network.named_modules()``. A *source* tells for each input channel of a module which unit of the
+    layer it is; -1 stands for none of them.
 
     :param layer: The linear or convolutional layer
     :param n_units: Number of units
@@ -34,22 +34,22 @@ class HiddenUnits:
 
 def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
     """
-    Find the hidden layers by sending a tag of each unit through the network instead of its output: a number that is its own,
-    the same at all positions. Activations and LayerNorms let the tags pass; pooling, transposing, flattening and
+    Find the hidden layers by sending a tag of each unit through the network instead of its output: a number that no other unit
+    has, the same at all positions. Activations and LayerNorms let the tags pass; pooling, transposing, flattening and
     concatenation keep them; so the inputs of the next layer show which unit each of them is, however channels were flattened.
-    A sum, as in a residual connection, is no tag any more; its gradient with respect to the tags tells whose it was.
+    A sum, as in a residual connection, is no tag any more; its gradient with respect to the tags tells which units are in it.
 
-    A layer is left out when any of its units feeds something else than a known place in a linear or convolutional layer: where
-    it is added to a residual stream, has grouped convolutions or modules that are not known here behind it, or is an output.
+    A layer is left out when any of its units feeds something other than a known place in a linear or convolutional layer: when
+    it is added to a residual stream, is an output, or is followed by grouped convolutions or modules that are not known here.
 
     :param network: The network, in evaluation mode
-    :param run: Calls it on a batch of one observation of zeros, which no tag can be mistaken for
+    :param run: Calls it on a batch of one observation of zeros, which cannot be mistaken for tags
     :return: The layers, in the order of ``network.named_modules()``
     """
     names = {module: name for name, module in network.named_modules()}
     layers = [module for module in names if _is_layer(module)]
     sizes = [layer.weight.shape[0] for layer in layers]
-    # Above 1, the greatest number in an encoded observation of zeros; below 2, and so no sum of tags is another
+    # Above 1, the greatest number in an encoded observation of zeros, and below 2, so that no sum of tags equals a tag
     tags = [
         (1 + unit * 2.0**-22).to(layer.weight).requires_grad_()
         for layer, unit in zip(layers, th.arange(1, sum(sizes) + 1).split(sizes), strict=True)
@@ -61,7 +61,7 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
         if module in tag_of:
             arrived[module] = _channels_last(module, inputs[0])
             tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
-            return tagged.clone()  # for activations that write into what they are given
+            return tagged.clone()  # for activations that write into their inputs
         if isinstance(module, CReLU):
             return th.cat([inputs[0], inputs[0]], dim=1)
         if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
@@ -80,11 +80,11 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
 
     found, first = [], 0
     for layer, size in zip(layers, sizes, strict=True):
-        ours = {
+        layer_sources = {
             module: th.where((source >= first) & (source < first + size), source - first, -1)
             for module, source in sources.items()
         }
-        reached = {names[module]: source for module, source in ours.items() if (source >= 0).any()}
+        reached = {names[module]: source for module, source in layer_sources.items() if (source >= 0).any()}
         outgoing = {name: source for name, source in reached.items() if _is_layer(network.get_submodule(name))}
         norms = {name: source for name, source in reached.items() if name not in outgoing}
         if outgoing and not elsewhere[first : first + size].any():
@@ -98,8 +98,8 @@ def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable
     :param network: The network
     :param layers: Its hidden units
     :param run: Calls it on a batch of observations
-    :return: For each layer, :func:`~sb3_cchain.analysis.metrics.dormancy.mean_activity` of its units ``(n_units,)``, where
-        the next layers receive them
+    :return: For each layer, :func:`~sb3_cchain.analysis.metrics.dormancy.mean_activity` of its units ``(n_units,)``, as the
+        next layers receive them
     """
     modules = {network.get_submodule(name): name for layer in layers for name in layer.outgoing}
     activity: dict[str, th.Tensor] = {}
@@ -110,13 +110,13 @@ def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable
     with forward_hooks(modules, measure), th.no_grad():
         run()
 
-    of_layers = []
+    layer_activity = []
     for layer in layers:
         received = th.cat([activity[name][source >= 0] for name, source in layer.outgoing.items()])
         units = th.cat([source[source >= 0] for source in layer.outgoing.values()])
         total = received.new_zeros(layer.n_units).index_add(0, units, received)
-        of_layers.append(total / units.bincount(minlength=layer.n_units))
-    return of_layers
+        layer_activity.append(total / units.bincount(minlength=layer.n_units))
+    return layer_activity
 
 
 def _is_layer(module: nn.Module) -> bool:
@@ -128,7 +128,7 @@ def _channel_dim(module: nn.Module) -> int:
 
 
 def _channels_last(module: nn.Module, inputs: th.Tensor) -> th.Tensor:
-    """As a matrix: batch and positions, channels."""
+    """Inputs as a matrix ``(batch and positions, channels)``."""
     return inputs.movedim(_channel_dim(module), -1).flatten(end_dim=-2)
 
 
@@ -139,7 +139,7 @@ def _read(all_tags: th.Tensor, tagged: th.Tensor) -> th.Tensor:
 
 
 def _feeds_more(tagged: th.Tensor, source: th.Tensor, tags: list[th.Tensor]) -> th.Tensor:
-    """For each tag, whether it has part in these inputs other than by being one of them."""
+    """For each tag, whether these inputs depend on it in any other way than by being it."""
     weights = th.arange(1.0, len(source) + 1, dtype=tagged.dtype, device=tagged.device)
     gradients = th.autograd.grad(tagged.mean(dim=0) @ weights, tags, retain_graph=True, materialize_grads=True)
     known = source >= 0

@@ -22,19 +22,20 @@ class L2Init(Penalty):
     L2 regularisation towards the initial parameters (Regenerative Regularization): adds c·‖θ − θ₀‖² to the loss. With
     ``towards="zero"`` it is plain L2 regularisation, c·‖θ‖² (in the loss, unlike AdamW's weight decay).
 
-    Paper: https://arxiv.org/abs/2308.11958 (Kumar et al., 2023), whose equation has the sum over all entries, as here by
-    default. Its code (https://github.com/skumar9876/L2_Init) has half of that sum, and leaves LayerNorm's parameters out;
-    here all parameters of the optimiser are in (target networks are none).
+    Paper: https://arxiv.org/abs/2308.11958 (Kumar et al., 2023). Its equation has the sum over all entries, which is the
+    default here. Its code (https://github.com/skumar9876/L2_Init) has half of that sum and leaves out the parameters of
+    LayerNorm. Here all parameters of the optimiser are included; those of target networks are not among them.
 
-    The C-CHAIN paper takes the best c of 0.1, 1, 10, 100 and 1000, and does not say of what; the code of that comparison is
-    not public. L2 Init's own code tries 1e-5 … 1e-2 of half the sum. With the 270 000 entries of the paper's Gym Control
-    networks that is 1.4 … 1400 of the mean, so the grid is likely to be one for ``reduction="mean"``.
+    The C-CHAIN paper takes the best c of 0.1, 1, 10, 100 and 1000. It does not say whether c multiplies a sum or a mean, and
+    the code of that comparison is not public. L2 Init's own code tries 1e-5 … 1e-2 of half the sum. With the 270 000 entries
+    of the paper's Gym Control networks that is 1.4 … 1400 of the mean, so the grid is likely to be one for
+    ``reduction="mean"``.
 
-    θ₀ are the parameters at the first update. It is saved with the model, and restored by ``load()``.
+    θ₀ is the vector of parameters at the first update. It is saved with the model and restored by ``load()``.
 
     Logged: ``l2_init/loss``, c·‖θ − θ₀‖²; ``l2_init/distance``, ‖θ − θ₀‖₂.
 
-    Costs a few operations per parameter tensor and update, and a copy of the parameters.
+    It costs a few operations per parameter tensor and update, and a copy of the parameters.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate
@@ -84,7 +85,7 @@ class L2Init(Penalty):
 
     def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """
-        :return: 2 (θ − θ₀) for each parameter, or the mean's gradient
+        :return: 2 (θ − θ₀) for each parameter, divided by the number of entries for the mean
         """
         factor = 2 / self._n_entries()
         return [(p, difference.mul_(factor)) for p, difference in zip(self.parameters(), self._differences(), strict=True)]
@@ -92,6 +93,6 @@ class L2Init(Penalty):
     @th.no_grad()
     def metrics(self) -> dict[str, float]:
         """
-        :return: ``l2_init/loss`` and ``l2_init/distance``, and what the wrappers inside did
+        :return: ``l2_init/loss`` and ``l2_init/distance``, and the metrics of the wrappers inside
         """
         return {**super().metrics(), "l2_init/distance": self._squared_distance().sqrt().item()}

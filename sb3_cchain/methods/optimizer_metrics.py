@@ -1,4 +1,4 @@
-"""Logs what wrapped optimisers did."""
+"""Logs the metrics of wrapped optimisers."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -9,10 +9,10 @@ from sb3_cchain.networks.model_optimizers import model_optimizers
 
 class OptimizerMetrics(BaseCallback):
     """
-    Logs the metrics of the model's optimisers, as ``trac/scale`` and ``l2_init/distance``: at each rollout's end, or, with
-    off-policy algorithms, at each episode's. They tell of the updates before it.
+    Logs the metrics of the model's optimisers, such as ``trac/scale`` and ``l2_init/distance``: at the end of each rollout,
+    with off-policy algorithms at the end of each episode. They describe the updates before it.
 
-    With actor and critic apart (SAC, TD3) the names end in ``_actor`` and ``_critic``.
+    With separate optimisers of actor and critic (SAC, TD3) the names end in ``_actor`` and ``_critic``.
 
     It raises a ``TypeError`` when no optimiser of the model is an :class:`~sb3_cchain.methods.OptimizerWrapper`.
     """

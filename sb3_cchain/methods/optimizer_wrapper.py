@@ -1,4 +1,4 @@
-"""An optimiser around another one."""
+"""An optimiser that wraps another one."""
 
 import inspect
 from collections.abc import Callable
@@ -11,31 +11,31 @@ from torch.optim.optimizer import ParamsT
 
 class OptimizerWrapper(th.optim.Optimizer):
     """
-    An optimiser that adds something to the steps, or to the gradients, of another one. It is that one in all else: the
-    parameter groups and the state are the base's own, so SB3's learning rate schedules, torch's, and whoever looks into
-    ``optimizer.state[parameter]`` find what they expect.
+    An optimiser that adds something to the steps, or to the gradients, of another one, the base. In everything else it behaves
+    as the base: they share the parameter groups and the state, so the learning rate schedules of SB3 and torch, and code that
+    reads ``optimizer.state[parameter]``, find what they expect.
 
-    What a wrapper itself has to remember stands in the same state under its ``name``, hence is saved and loaded with it. It
-    is made when first needed: a checkpoint of the base alone can be loaded, and the wrapper starts anew from its parameters,
-    as it does after ``optimizer.state.clear()``.
+    What a wrapper itself has to remember is kept in the same state under its ``name``, so it is saved and loaded with it. It
+    is made when first needed: a checkpoint of the base alone can be loaded, and the wrapper then starts from the parameters in
+    it, as it does after ``optimizer.state.clear()``.
 
     Wrappers nest, and the outermost acts last::
 
         TRAC(parameters, lr=1e-3, base_class=WeightClipping, base_kwargs=dict(clip_ratio=1.0, base_kwargs=dict(eps=1e-5)))
 
-    Hooks that are registered with one of the nested optimisers run once, at its own step. Each of them being an optimiser,
-    hooks for all optimisers (``register_optimizer_step_pre_hook``) run for each.
+    Hooks that are registered with one of the nested optimisers run once, at its own step. Hooks for all optimisers
+    (``register_optimizer_step_pre_hook``) run for each of them.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate of the base
-    :param base_class: Class of the optimiser inside, which may be another wrapper. It must not need a closure (as LBFGS does).
+    :param base_class: Class of the optimiser inside, which may be another wrapper. It must not need a closure, as LBFGS does.
     :param base_kwargs: Its keyword arguments, learning rate excluded. SB3 gives ``eps=1e-5`` to a plain Adam in actor-critic
-        policies, but to no other class: for the same, set ``base_kwargs=dict(eps=1e-5)``.
-    :raises TypeError: When ``base_class`` is no optimiser class, or one that needs a closure
+        policies, but to no other class. To get the same here, set ``base_kwargs=dict(eps=1e-5)``.
+    :raises TypeError: When ``base_class`` is not an optimiser class, or needs a closure
     :raises ValueError: When a wrapper is nested in another one of its kind
     """
 
-    # Key of the state, prefix of the log
+    # Key in the state, and prefix in the log
     name: ClassVar[str]
 
     def __init__(
@@ -60,7 +60,7 @@ class OptimizerWrapper(th.optim.Optimizer):
             if inner.name == self.name:
                 raise ValueError(f"`base_class` must not contain another {type(self).__name__}, got {base_class.__name__}")
             inner = inner.base
-        # As `Optimizer.__init__`, less the parameter groups and the state of its own that it would make
+        # As `Optimizer.__init__`, which would also make new parameter groups and a new state
         self.__setstate__({})
 
     @property
@@ -80,7 +80,7 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     @property
     def own_state(self) -> dict[str, Any]:
-        """What the wrapper remembers, by name. Replace the values, don't change them: a saved state shares them."""
+        """What the wrapper remembers, by name. Replace the values, never change them in place: a saved state shares them."""
         return self.state[self.name]  # an empty one at first: torch's state is a defaultdict
 
     def parameters(self) -> list[th.Tensor]:
@@ -91,9 +91,9 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     def reference(self) -> list[th.Tensor]:
         """
-        :return: A copy of each parameter, from when this was first called (or first with that parameter). Optimisers are made
-            before SB3 moves a policy to its device, and before some policies initialise their weights: the first call must
-            come in training.
+        :return: A copy of each parameter, made when this was first called, or first called with that parameter. SB3 makes
+            optimisers before it moves a policy to its device, and before some policies initialise their weights, so the first
+            call must come in training.
         """
         parameters = self.parameters()
         known = self.own_state.get("reference", [])
@@ -110,7 +110,7 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """
-        :param closure: Computes the loss and its gradients. It is called once, before all else.
+        :param closure: Computes the loss and its gradients. It is called once, before everything else.
         :return: Its loss
         """
         loss = None
@@ -123,7 +123,8 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     def _step(self) -> None:
         """
-        What a subclass changes. (Not ``step()``, which torch wraps in the hooks: ``super().step()`` could run them again.)
+        A subclass extends this method. (It must not extend ``step()``: torch wraps that in the hooks, and ``super().step()``
+        could run them again.)
         """
         self.base.step()
 
@@ -135,18 +136,18 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     def metrics(self) -> dict[str, float]:
         """
-        :return: What it did and what the wrappers inside did, by name, for :class:`~sb3_cchain.methods.OptimizerMetrics`
+        :return: Its metrics and those of the wrappers inside, by name, for :class:`~sb3_cchain.methods.OptimizerMetrics`
         """
         return self.base.metrics() if isinstance(self.base, OptimizerWrapper) else {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # As torch's, without hooks, and without methods that were replaced on the instance
+        # As torch's: without hooks, and without methods that were replaced on the instance
         return {name: value for name, value in vars(self).items() if not (name.startswith("_optimizer") or callable(value))}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Called by `copy`, `pickle`, and by `load_state_dict` with new groups and state
-        of_base = {name: value for name, value in state.items() if name in ("param_groups", "state")}
-        super().__setstate__({name: value for name, value in state.items() if name not in of_base})
-        if of_base:
-            self.base.__setstate__(of_base)
-            self.state[self.name] = dict(self.own_state)  # the saved state's owner goes on with its own
+        base_state = {name: value for name, value in state.items() if name in ("param_groups", "state")}
+        super().__setstate__({name: value for name, value in state.items() if name not in base_state})
+        if base_state:
+            self.base.__setstate__(base_state)
+            self.state[self.name] = dict(self.own_state)  # a copy, because the owner of the saved state goes on changing it

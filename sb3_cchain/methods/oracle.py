@@ -14,15 +14,16 @@ add_charts("Related methods", {"Oracle: resets": "oracle/n_resets"})
 
 class Oracle(TaskBoundary):
     """
-    Re-initialises networks and optimiser whenever the task switches: the agent that is told of the switches and carries
-    nothing over them, the oracle of the C-CHAIN paper (https://arxiv.org/abs/2506.00592, Section 5).
+    Re-initialises networks and optimiser whenever the task switches. Such an agent knows about the switches and carries
+    nothing over from one task to the next; it is the oracle of the C-CHAIN paper (https://arxiv.org/abs/2506.00592, Section
+    5).
 
-    The parameters become a fresh draw of their initialisation (the target network's the same one), the optimiser that of a
-    fresh model, without moments or steps. C-CHAIN, where the model has it, forgets its reference batch and the history of λ.
-    All objects stay the same ones.
+    The parameters become a fresh draw of their initialisation, the same one for the target network. The optimiser becomes that
+    of a fresh model, without moments or steps. C-CHAIN, where the model has it, forgets its reference batch and the history of
+    λ. No object is replaced.
 
-    It happens between rollouts, before the first action in the new task where tasks last for whole rollouts; otherwise up to a
-    rollout late: the rollout that has data of both tasks trains the network that is then dropped.
+    It happens between rollouts. When tasks last for whole rollouts, that is before the first action in the new task. Otherwise
+    it is up to a rollout late: the rollout that has data of both tasks trains the network that is then dropped.
 
     It costs one construction of the policy per task. Logged: ``oracle/n_resets``, the resets since ``learn()`` was called.
 
@@ -30,7 +31,7 @@ class Oracle(TaskBoundary):
     (:class:`~sb3_cchain.envs.TaskVecNormalize` restarts them). The released code makes a whole new agent for each task, which
     in MinAtar includes the replay buffer (``reset_replay_buffer=True`` here) and the exploration rate.
 
-    :param reset_replay_buffer: Whether to empty the replay buffer, too
+    :param reset_replay_buffer: Whether to empty the replay buffer too
     :raises TypeError: When ``reset_replay_buffer`` is not a boolean; when training starts, for an environment that is not
         continual, for algorithms with several optimisers, and where there is no replay buffer that can be emptied
     """

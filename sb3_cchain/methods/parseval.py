@@ -17,18 +17,18 @@ class Parseval(Penalty):
     Parseval regularisation: adds c·Σ ‖W Wᵀ − s·I‖²_F over the weight matrices W to the loss, which keeps the weights of the
     units of a layer (the rows of W) orthogonal to each other and of norm √s.
 
-    Paper: https://arxiv.org/abs/2412.07224 (Chung et al., NeurIPS 2024). As there and in its code
-    (https://github.com/wechu/parseval_reg): all layers but the output layers; rows, also where there are more of them than
-    columns, so that they can't all be orthogonal; biases are free. The convolutions that the paper's networks lack are taken
-    as matrices with a row for each filter.
+    Paper: https://arxiv.org/abs/2412.07224 (Chung et al., NeurIPS 2024). As in its code
+    (https://github.com/wechu/parseval_reg), it covers all layers but the output layers, and biases are free. It is about rows
+    also when there are more rows than columns, so that they cannot all be orthogonal. The paper's networks have no
+    convolutions; here these are taken as matrices with a row for each filter.
 
     An optimiser knows parameters only by their order, so ``n_output_layers`` tells how many matrices at the end are output
-    layers: 2 for PPO and A2C (``action_net`` and ``value_net``), 1 for DQN. gSDE's ``log_std`` is a matrix too, and would be
-    regularised: leave ``use_sde=False``.
+    layers: 2 for PPO and A2C (``action_net`` and ``value_net``), 1 for DQN. The ``log_std`` of gSDE is a matrix too
+    and would be regularised, so leave ``use_sde=False``.
 
     Logged: ``parseval/loss``, the penalty times c.
 
-    Costs two matrix products per weight matrix and update.
+    It costs two matrix products per weight matrix and update.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate

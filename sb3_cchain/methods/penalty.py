@@ -13,8 +13,8 @@ class Penalty(OptimizerWrapper):
     """
     Minimises the loss plus ``coef`` times :meth:`penalty`.
 
-    Training loops run ``zero_grad → loss.backward → (clip) → step``, and gradients accumulate in PyTorch: ``zero_grad()``
-    leaves the penalty's gradient behind, so the update is the one of the sum, clipped as the sum is.
+    Training loops run ``zero_grad → loss.backward → (clip) → step``, and gradients accumulate in PyTorch. Here ``zero_grad()``
+    sets the gradients to those of the penalty, so the update follows the gradient of the sum, which is clipped as a whole.
 
     :param params: As for ``OptimizerWrapper``
     :param lr: As for ``OptimizerWrapper``
@@ -36,8 +36,8 @@ class Penalty(OptimizerWrapper):
 
     def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """
-        :return: The parameters that the penalty depends on, each with its gradient, a new tensor. It is asked for in closed
-            form, as autograd takes several times as long for a sum of squares.
+        :return: The parameters that the penalty depends on, each with its gradient as a new tensor. Subclasses compute it in
+            closed form, because autograd takes several times as long for a sum of squares.
         """
         raise NotImplementedError()
 
@@ -57,6 +57,6 @@ class Penalty(OptimizerWrapper):
     @th.no_grad()
     def metrics(self) -> dict[str, float]:
         """
-        :return: What the wrappers inside did, and ``<name>/loss``, the penalty times ``coef``
+        :return: The metrics of the wrappers inside, and ``<name>/loss``, the penalty times ``coef``
         """
         return {**super().metrics(), f"{self.name}/loss": self.coef * self.penalty().item()}

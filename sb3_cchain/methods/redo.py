@@ -36,28 +36,28 @@ class ReDo(TrainingInterval):
 
     .. math:: s_i = E_x |h_i(x)| \, / \, \frac{1}{H} \sum_k E_x |h_k(x)|
 
-    on a batch of observations is at most τ is recycled: its incoming weights and bias are drawn anew from the initialisation
-    of the network, its outgoing weights become 0, and so do Adam's moments of all of them (not its count of steps). The
-    outputs of the network so remain what they are, up to the little that the unit contributed.
+    on a batch of observations is at most τ is recycled: its incoming weights and bias are drawn again from the initialisation
+    of the network, its outgoing weights become 0, and Adam's moments of all these weights become 0 (its step count stays). The
+    outputs of the network stay the same, except for the little that the unit contributed.
 
     On-policy algorithms (PPO, A2C) recycle after ``train()``, on observations of the rollout that it was trained on; DQN on a
-    sample of the replay buffer, its target network being left to follow. Any chain of linear and convolutional layers is
-    served, with shared or separate networks for policy and value. A unit is recycled only if all of its outgoing weights are
-    known: not one whose output is added to a residual stream (in an IMPALA network the first convolution of each residual
-    block and the linear layer are recycled, as in the original's), nor an output of the network.
+    sample of the replay buffer; its target network follows by its usual updates. It works with any chain of linear and
+    convolutional layers, with shared or separate networks for policy and value. A unit is recycled only if all of its outgoing
+    weights are known. This leaves out the outputs of the network and units whose output is added to a residual stream. In an
+    IMPALA network, the first convolution of each residual block and the linear layer are recycled, as in the original code.
 
-    Defaults: τ = 0.025 and 1000 updates are those of the paper's DQN; for on-policy algorithms, 10 iterations and the same τ
-    those of Plasticine's PPO (https://github.com/RLE-Foundation/Plasticine). The batch is the original code's 256. What the
-    C-CHAIN paper compares with has not been published.
+    Defaults: τ = 0.025 and 1000 updates are those of the paper's DQN. For on-policy algorithms, 10 iterations and the same τ
+    are those of Plasticine's PPO (https://github.com/RLE-Foundation/Plasticine). The batch size 256 is that of the original
+    code. The settings in the C-CHAIN paper's comparison have not been published.
 
-    Deviations from the original code: the incoming weights have the initialisation of the policy at hand (orthogonal, Xavier,
-    PyTorch's), where it draws after Xavier; the bias, too, where it becomes 0. The activation is measured where the next layer
-    receives it, thus behind a pooling. A LayerNorm between a layer and its activation, which the original's networks have not,
-    is re-initialised at the unit's place; as it normalises over all units, the outputs of the others then move, too. With gSDE
-    the noise, which reads the last hidden layer, is not touched.
+    Differences from the original code: incoming weights and bias have the initialisation of the policy at hand (orthogonal,
+    Xavier, PyTorch's); the original draws the weights after Xavier and sets the bias to 0. The activation is measured as the
+    next layer receives it, so behind a pooling. The original's networks have no LayerNorm; here a LayerNorm between a layer
+    and its activation is re-initialised at the unit's place. Because it normalises over all units, the outputs of the others
+    then move too. With gSDE the noise, which reads the last hidden layer, is not touched.
 
-    It costs one forward pass of the batch per recycling, and a construction of the policy if there are units to recycle. With
-    C-CHAIN, the reference batch is forgotten then, so that churn reduction does not undo it.
+    It costs one forward pass of the batch per recycling, and a construction of the policy when there are units to recycle.
+    With C-CHAIN, the reference batch is then forgotten, so that churn reduction does not undo the recycling.
 
     Logged: ``redo/n_recycled``, the units recycled since ``learn()`` was called; ``redo/dormant_share``, the share of units
     that were τ-dormant the last time, and ``redo/dormant_share/<layer>`` of each layer (not in the table on the screen).
@@ -110,7 +110,7 @@ class ReDo(TrainingInterval):
             self._observations = None
 
     def _on_training_end(self) -> None:
-        self._on_rollout_start()  # what is due now is not left to a learn() to come
+        self._on_rollout_start()  # not left to the next `learn()`
 
     def _forward(self, observations: PyTorchObs) -> Callable[[], Any]:
         if isinstance(self.model, DQN):
@@ -121,7 +121,7 @@ class ReDo(TrainingInterval):
     def _recycle(self, observations: PyTorchObs) -> None:
         policy = self.model.policy
         activity = hidden_activity(policy, self._layers, self._forward(observations))
-        dormant = [dormant_scores(of_layer) <= self.tau for of_layer in activity]
+        dormant = [dormant_scores(layer_activity) <= self.tau for layer_activity in activity]
         n_dormant = sum(int(units.sum()) for units in dormant)
         if n_dormant:
             fresh = fresh_policy(self.model)
@@ -141,7 +141,7 @@ def recycle_units(
     layer: HiddenUnits, units: th.Tensor, network: nn.Module, fresh: nn.Module, optimizer: th.optim.Optimizer
 ) -> None:
     """
-    Incoming weights drawn anew, outgoing ones and the moments of both 0.
+    Draw the incoming weights again, and set the outgoing ones and the moments of both to 0.
 
     :param layer: A hidden layer of the network
     :param units: Which of its units to recycle, ``(n_units,)``, of booleans

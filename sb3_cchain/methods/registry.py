@@ -70,7 +70,7 @@ class Method:
 
     @property
     def is_related(self) -> bool:
-        """Whether it is settings of an algorithm, not an algorithm of its own."""
+        """Whether it consists of settings of an algorithm, rather than being an algorithm."""
         return bool(self.optimizer_class or self.callbacks or self.policy != "MlpPolicy")
 
 

@@ -27,11 +27,12 @@ class ShrinkAndPerturb(TaskBoundary):
     https://arxiv.org/abs/2405.19153), where it goes together with LayerNorm. Plasticine's *hard* variant, every so many
     iterations, is a greater ``interval``.
 
-    Each step builds the policy anew, which with ``interval=1`` may cost more than the update itself. A step with
-    :math:`\alpha^n` after every :math:`n` updates shrinks alike at an n-th of the cost.
+    Each step constructs a new policy, which with ``interval=1`` may cost more than the update itself. A step with
+    :math:`\alpha^n` after every :math:`n` updates shrinks as much at an n-th of the cost.
 
-    The optimiser's moments and the target network are left alone. With C-CHAIN, a step after an update counts as part of it,
-    also in its churn; at a task switch the reference batch is forgotten, so that churn reduction does not undo the step.
+    The optimiser's moments and the target network are left alone. With C-CHAIN, a step after an update counts as part of that
+    update, also in its churn. At a task switch the reference batch is forgotten, so that churn reduction does not undo the
+    step.
 
     Logged: ``shrink_and_perturb/n_steps``, the steps since ``learn()`` was called.
 

@@ -17,8 +17,8 @@ add_charts("Related methods", {"TRAC: scale": "trac/scale(_.+)?"})
 
 class TRAC(OptimizerWrapper):
     """
-    TRAC, a parameter-free tuner around any optimiser: it scales how far the base has moved the parameters away from where they
-    started, by a factor S that grows while the gradients agree with that direction and shrinks, down to 0, when they do not.
+    TRAC, a parameter-free tuner around any optimiser. It scales the distance by which the base has moved the parameters from
+    where they started. The factor S grows while the gradients agree with that direction, and shrinks, down to 0, when not.
 
     Paper: https://arxiv.org/abs/2405.16642 (Muppidi et al., NeurIPS 2024, Algorithms 1 and 2). With parameters θ, which start
     at θ_ref, gradient g, base update u, and a tuner for each discount β with σ (1e-8 at first) and v (0), an update is
@@ -28,14 +28,14 @@ class TRAC(OptimizerWrapper):
     - S = Σ_β s₀ · erfi(σ / (√(2v) + ε)) / erfi(1/√2)
     - θ ← θ_ref + (d + u) · max(S, 0)
 
-    with one S over all parameters. It equals the authors' package, ``trac-optimizer`` 0.0.2, up to rounding, including that
+    with one S over all parameters. Up to rounding it equals the authors' package, ``trac-optimizer`` 0.0.2, including that
     package's approximation of erfi, which is off by up to 1.1 % near 0. Unlike the package, it can be saved and loaded, writes
     no file, and leaves gradients enabled when something fails.
 
     Logged: ``trac/scale``, max(S, 0).
 
-    Costs, per update, a copy of the parameters and a few operations per parameter tensor (on a GPU: one synchronisation);
-    and a copy of the parameters is kept.
+    Each update costs a copy of the parameters and a few operations per parameter tensor (on a GPU, one synchronisation). One
+    more copy of the parameters is kept.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate of the base
@@ -43,7 +43,7 @@ class TRAC(OptimizerWrapper):
     :param s_init: s₀, the scale to start from
     :param eps: ε
     :param kwargs: ``base_class`` and ``base_kwargs``, as for :class:`~sb3_cchain.methods.OptimizerWrapper`
-    :raises TypeError: When ``betas`` is no list
+    :raises TypeError: When ``betas`` is not a list
     :raises ValueError: Naming the argument that is out of its range; in ``step()``, when the gradients are not finite
     """
 
@@ -97,15 +97,15 @@ class TRAC(OptimizerWrapper):
 
     def metrics(self) -> dict[str, float]:
         """
-        :return: ``trac/scale``, and what the wrappers inside did
+        :return: ``trac/scale``, and the metrics of the wrappers inside
         """
         return {**super().metrics(), "trac/scale": max(self.own_state.get("scale", 0.0), 0.0)}
 
 
 def _weideman_coefficients(n: int = 128) -> tuple[float, np.ndarray]:
     """
-    Of Weideman's rational approximation of w(z) = exp(−z²) erfc(−iz) (SIAM J. Numer. Anal. 31(5), 1994). He takes 4n points
-    and the value 0 at infinity; trac-optimizer leaves the latter out, hence so do we.
+    Coefficients of Weideman's rational approximation of w(z) = exp(−z²) erfc(−iz) (SIAM J. Numer. Anal. 31(5), 1994). He takes
+    4n points and the value 0 at infinity. trac-optimizer leaves out the value at infinity, so it is left out here too.
 
     :param n: Number of terms
     :return: The scale L, and the coefficients, highest power first

@@ -18,21 +18,23 @@ class WeightClipping(OptimizerWrapper):
     Weight clipping: after each update, every parameter is clipped to ± κ·b, where b is the bound of its initialisation.
 
     Paper: https://arxiv.org/abs/2407.01704 (Elsayed et al., 2024). As in its code (https://github.com/mohmdelsayed/weight-clipping),
-    b = 1/√fan_in, the bound of PyTorch's default initialisation, whatever the parameters were initialised with:
+    b = 1/√fan_in, the bound of PyTorch's default initialisation, also when the parameters had another initialisation:
 
-    - of a linear layer, fan_in is the number of inputs; of a convolution, input channels (of a group) times kernel size;
-    - a vector takes the bound of the weight before it: the bias of that layer, but a LayerNorm's gain and bias, too. Gains
-      start at 1, so a small κ shrinks them, as in the original;
+    - the fan_in of a linear layer is the number of inputs; that of a convolution is input channels (of a group) times kernel
+      size;
+    - a vector takes the bound of the weight before it. This holds for the bias of that layer, and also for the gain and bias
+      of a LayerNorm. Gains start at 1, so a small κ shrinks them, as in the original;
     - the output layer is clipped like the others.
 
-    A vector with no weight before it, as the ``log_std`` of SB3's actor-critic policies, is left alone; the original fails.
+    A vector with no weight before it, such as the ``log_std`` of SB3's actor-critic policies, is left alone; the original
+    fails on it.
 
-    SB3's orthogonal initialisation (PPO and A2C, gain √2) exceeds b in a good part of the entries: with κ near 1 set
+    SB3's orthogonal initialisation (PPO and A2C, gain √2) exceeds b in many of the entries. With κ near 1, set
     ``ortho_init=False``, as the C-CHAIN paper's Gym Control does.
 
     Logged: ``weight_clipping/share``, the share of all entries that the last update left at their bound.
 
-    Costs one operation per parameter tensor and update.
+    It costs one operation per parameter tensor and update.
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate
@@ -70,7 +72,7 @@ class WeightClipping(OptimizerWrapper):
     @th.no_grad()
     def metrics(self) -> dict[str, float]:
         """
-        :return: ``weight_clipping/share``, and what the wrappers inside did
+        :return: ``weight_clipping/share``, and the metrics of the wrappers inside
         """
         at_bound = [p.abs() >= bound for p, bound in zip(self.parameters(), self.bounds(), strict=True)]
         n_entries = sum(entries.numel() for entries in at_bound)

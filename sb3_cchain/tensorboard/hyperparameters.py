@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # TensorBoard need not be installed
     from torch.utils.tensorboard import SummaryWriter
 
 _SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
-# Arguments that training does not depend on, and those that are named otherwise
+# Arguments that training does not depend on, and those that have another name here
 _LEFT_OUT = ("policy", "env", "verbose", "stats_window_size", "tensorboard_log")
 
 
@@ -23,12 +23,12 @@ class TensorBoardHyperparameters(KVWriter):
     """
     Writes hyperparameters to TensorBoard at the first log, unless the user logs some by SB3's ``HParam`` then.
 
-    ``HParam`` itself would write a list of columns, too. TensorBoard takes the list of one of the runs, whichever, for all of
-    them: beside PPO, C-CHAIN's arguments would be missing. Without a list it shows what any of the runs has.
+    ``HParam`` itself would also write a list of columns. TensorBoard takes the list of any one of the runs for all of them, so
+    C-CHAIN's arguments could be missing next to a run of PPO. Without a list it shows the columns of all runs.
 
-    It is an output of SB3's logger, beside the one for TensorBoard.
+    It is another output of SB3's logger, next to the one for TensorBoard.
 
-    :param writer: That of SB3's output for TensorBoard
+    :param writer: The writer of SB3's output for TensorBoard
     :param values: Hyperparameter → value
     """
 
@@ -53,7 +53,7 @@ class TensorBoardHyperparameters(KVWriter):
         self._first = False
 
     def close(self) -> None:
-        """Nothing of its own to close."""
+        """Nothing to close: the writer belongs to SB3's output."""
 
 
 def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
@@ -104,5 +104,5 @@ def _env_id(model: BaseAlgorithm) -> str | None:
         return None
     try:
         return env.get_attr("spec", indices=0)[0].id
-    except Exception:  # whatever a vectorised environment of somebody's answers; its name is not worth a run
+    except Exception:  # any vectorised environment may fail here; a name is not worth a run
         return None

@@ -47,7 +47,7 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Distance from initialisation": "health/distance_from_init(/.+)?",
         "Norm of the gradient, after clipping": "health/gradient_norm(/.+)?",
     },
-    # Methods add theirs by `add_charts`
+    # Each method adds its charts by `add_charts`
     "Related methods": {},
 }
 
@@ -64,12 +64,12 @@ def add_charts(category: str, charts: dict[str, str]) -> None:
 
 class TensorBoardLayout(KVWriter):
     """
-    Lays out in TensorBoard's Custom Scalars tab what the logger writes: those charts of ``LAYOUT`` of which a tag was logged.
+    Lays out TensorBoard's Custom Scalars tab: the charts of ``LAYOUT`` that have a tag which was logged.
 
-    It is an output of SB3's logger, beside the one for TensorBoard. The layout is written whenever a chart is added to it;
-    TensorBoard shows the latest.
+    It is another output of SB3's logger, next to the one for TensorBoard. The layout is written whenever a chart is added to
+    it; TensorBoard shows the latest.
 
-    :param writer: That of SB3's output for TensorBoard
+    :param writer: The writer of SB3's output for TensorBoard
     """
 
     def __init__(self, writer: "SummaryWriter"):
@@ -101,7 +101,7 @@ class TensorBoardLayout(KVWriter):
             self._writer.flush()
 
     def close(self) -> None:
-        """Nothing of its own to close."""
+        """Nothing to close: the writer belongs to SB3's output."""
 
 
 def layout_of(tags: set[str]) -> dict[str, dict[str, str]]:
@@ -113,4 +113,4 @@ def layout_of(tags: set[str]) -> dict[str, dict[str, str]]:
         category: {title: regex for title, regex in charts.items() if any(re.fullmatch(regex, tag) for tag in tags)}
         for category, charts in LAYOUT.items()
     }
-    return {category: of_category for category, of_category in charts.items() if of_category}
+    return {category: shown for category, shown in charts.items() if shown}

@@ -1,4 +1,4 @@
-"""A TensorBoard in which nothing needs to be arranged: charts in groups, and the hyperparameters."""
+"""Sets up TensorBoard: charts in groups, and the hyperparameters."""
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -12,12 +12,13 @@ class TensorBoardOverview(BaseCallback):
     """
     Groups the charts of a run in TensorBoard's Custom Scalars tab, and writes the hyperparameters to its HPARAMS tab.
 
-    The charts are those of returns, C-CHAIN, monitored churn, the NTK, network health and related methods of which something
-    is logged. The hyperparameters are the arguments of the model, and the names of its algorithm, policy and environment.
+    There are charts of returns, C-CHAIN, monitored churn, the NTK, network health and related methods, as far as they are
+    logged. The hyperparameters are the arguments of the model, and the names of its algorithm, policy and environment.
 
-    ``CChainPPO`` and ``CChainDQN`` do so by themselves, and so do ``CChainCallback``, ``ContinualMetrics`` and all callbacks
-    that look at networks during training. Give it to other algorithms without those. Nothing is done twice, nothing at all for
-    a model that does not log to TensorBoard. Hyperparameters that the user logs by SB3's ``HParam`` stand instead of these.
+    ``CChainPPO``, ``CChainDQN``, ``CChainCallback``, ``ContinualMetrics`` and all callbacks that look at networks during
+    training do the same by themselves, so give it to other algorithms without those callbacks. It does nothing twice, and
+    nothing for a model that does not log to TensorBoard. Hyperparameters that the user logs by SB3's ``HParam`` take the place
+    of these.
     """
 
     def _on_training_start(self) -> None:

@@ -1,4 +1,4 @@
-"""The gradients of many minibatches, each apart from the others."""
+"""The gradients of many minibatches, one for each."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,10 +19,10 @@ def minibatch_gradients(network: nn.Module, objective: Objective, minibatches: A
 
     :param network: The network
     :param objective: Called with one minibatch
-    :param minibatches: As one, with a further dimension in front: ``(n_minibatches, batch_size, ...)``
-    :param vectorize: Whether to compute them together (``torch.func.vmap``) where the objective allows it. It does not where
-        Python decides by the numbers (``if x > 0``), or tensors are changed in place. They are computed one after the other
-        then; the results are equal up to rounding.
+    :param minibatches: Like one minibatch, with a further dimension in front: ``(n_minibatches, batch_size, ...)``
+    :param vectorize: Whether to compute them together (``torch.func.vmap``) when the objective allows it. It does not when
+        Python decides by the numbers (``if x > 0``) or tensors are changed in place; the gradients are then computed one after
+        the other. The results are equal up to rounding.
     :return: For each parameter that the objective depends on, ``(n_minibatches, *parameter.shape)``
     """
     trained = {name: parameter for name, parameter in network.named_parameters() if parameter.requires_grad}
@@ -33,7 +33,7 @@ def minibatch_gradients(network: nn.Module, objective: Objective, minibatches: A
         try:
             return _together(network, objective, minibatches, {name: trained[name] for name in reached})
         except RuntimeError:
-            pass  # what is wrong with the objective itself is raised below
+            pass  # an error of the objective itself is raised below
     return _one_by_one(objective, minibatches, [trained[name] for name in reached])
 
 
@@ -76,8 +76,8 @@ def _one_by_one(objective: Objective, minibatches: Any, parameters: list[nn.Para
     for index in range(n_minibatches):
         with th.enable_grad():
             value = objective(_minibatch(minibatches, index))
-        for of_all, gradient in zip(gradients, th.autograd.grad(value, parameters), strict=True):
-            of_all[index] = gradient
+        for stacked, gradient in zip(gradients, th.autograd.grad(value, parameters), strict=True):
+            stacked[index] = gradient
     return gradients
 
 

@@ -1,4 +1,4 @@
-"""What is read off an empirical neural tangent kernel (NTK): pure functions of gradients and of the matrix."""
+"""Figures of an empirical neural tangent kernel (NTK): pure functions of gradients and of the matrix."""
 
 import math
 from collections.abc import Sequence

@@ -9,12 +9,11 @@ from sb3_cchain.validation import check_number
 
 def singular_values(matrix: th.Tensor) -> th.Tensor:
     r"""
-    :math:`\sigma_1 \ge \sigma_2 \ge \dots \ge 0`, computed in double precision and on the CPU, whatever the matrix has and
-    wherever it is.
+    :math:`\sigma_1 \ge \sigma_2 \ge \dots \ge 0`, always computed in double precision and on the CPU.
 
     :param matrix: ``(n_rows, n_columns)``
     :return: ``(min(n_rows, n_columns),)``, the greatest first, without gradient
-    :raises ValueError: When an entry is not finite, on which algorithms for singular values fail in ways of their own
+    :raises ValueError: When an entry is not finite, because algorithms for singular values then fail with unclear errors
     """
     if not matrix.isfinite().all():
         raise ValueError("`matrix` must be finite, got entries that are infinite or not a number")
@@ -33,7 +32,7 @@ def srank(singular_values: th.Tensor, delta: float = 0.01) -> int:
 
     :param singular_values: :func:`singular_values` of a matrix, the greatest first
     :param delta: δ. The default is that of all three papers.
-    :return: From 1 to the number of singular values; 0 for a matrix of zeros, and for none
+    :return: From 1 to the number of singular values; 0 for a matrix of zeros, and for no singular values
     :raises ValueError: When δ is not between 0 and 1
     """
     check_number("delta", delta, 0, 1)
@@ -49,11 +48,11 @@ def effective_rank(singular_values: th.Tensor) -> float:
 
     .. math:: \exp\big(-\textstyle\sum_i p_i \ln p_i\big), \quad p_i = \sigma_i / \sum_k \sigma_k
 
-    Roy & Vetterli (EUSIPCO 2007, https://ieeexplore.ieee.org/document/7098875), who call it effective rank; so does the
-    literature on :func:`srank`, for that one.
+    Roy & Vetterli (EUSIPCO 2007, https://ieeexplore.ieee.org/document/7098875) call it effective rank. The literature on
+    :func:`srank` uses the same name for that one.
 
     :param singular_values: :func:`singular_values` of a matrix
-    :return: From 1 to the number of singular values that are not 0; 0 for a matrix of zeros, and for none
+    :return: From 1 to the number of singular values that are not 0; 0 for a matrix of zeros, and for no singular values
     """
     if not singular_values.any():
         return 0.0
@@ -67,7 +66,7 @@ def condition_number(singular_values: th.Tensor) -> float:
     :math:`\sigma_d` of about :math:`10^{-16} \sigma_1`: values from about :math:`10^{15}` on tell no more than that.
 
     :param singular_values: :func:`singular_values` of a matrix, the greatest first
-    :return: At least 1; infinite where the least is 0, so for a matrix of zeros, too, and for none
+    :return: At least 1; infinite when the least is 0, which includes a matrix of zeros, and for no singular values
     """
     if len(singular_values) == 0 or singular_values[-1] == 0:
         return math.inf
