@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # Each package imports only from rows above its own and, without cycles, from its own
 ROWS = (
-    ("validation", "replaced"),
+    ("validation", "replaced", "gym_notice"),
     ("churn",),
     ("tasks", "envs", "networks"),
     ("callbacks", "tensorboard", "checkpoint"),
@@ -22,7 +22,7 @@ LEVEL = {package: level for level, row in enumerate(ROWS) for package in row}
 # Packages that only an extra installs, and the modules that may import them when they are imported themselves
 EXTRAS = {
     *("matplotlib", "seaborn", "pandas", "rliable", "scipy"),
-    *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "ray"),
+    *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "yaml", "ray"),
     *("procgen", "gym3", "gym", "minatar", "shimmy", "dm_control", "dm_env", "mujoco", "Box2D"),
 }
 MODULES_OF_EXTRAS = ("sb3_cchain.zoo", "benchmarks")

@@ -97,8 +97,9 @@ def test_every_module_is_imported_without_extras_or_names_its_extra(run, wheel):
     modules = {".".join(path.parts).removesuffix(".__init__") for path in files}
     path, errors = json.loads(run(["-c", IMPORT_ALL, *modules]))
     assert path.startswith(str(wheel))
-    assert set(errors) == {name for name in modules if name.startswith("sb3_cchain.zoo")}
-    assert all('pip install "sb3-cchain[zoo]"' in message for message in errors.values())
+    # The door to the command line names the extra; what is behind it fails with the missing module
+    assert all(name.startswith("sb3_cchain.zoo.") for name in errors)
+    assert 'pip install "sb3-cchain[zoo]"' in errors["sb3_cchain.zoo.cli"]
 
 
 TRAIN = """
@@ -162,7 +163,7 @@ def test_the_absence_of_each_extra_is_named(run):
 def test_trains_with_the_hyperparameters_inside_the_wheel(run, wheel):
     output = run(
         [
-            *("-m", "sb3_cchain.zoo.cli", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1"),
+            *("-m", "sb3_cchain.zoo", "train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1"),
             *("-n", "800", "-f", "logs", "--device", "cpu", "--eval-freq", "-1"),
         ],
         extra="zoo",

@@ -122,7 +122,7 @@ def _observation_shape(env_id: str) -> tuple[int, ...]:
         env = ContinualEnv([env_id], 1)
     except ImportError as error:
         if "Box2D" in str(error):
-            raise ImportError(f'{env_id} needs Box2D: pip install "sb3-cchain[box2d]"') from error
+            raise ImportError(f'{error}. It comes with: pip install "sb3-cchain[box2d]"') from error
         raise
     env.close()
     if not isinstance(env.observation_space, spaces.Box):

@@ -9,13 +9,17 @@ import sys
 import warnings
 from typing import Any
 
-import rl_zoo3.train
-import rl_zoo3.utils
-import yaml
-from huggingface_sb3 import EnvironmentName
-from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+try:
+    import rl_zoo3.train
+    import rl_zoo3.utils
+    import yaml
+    from huggingface_sb3 import EnvironmentName
+    from rl_zoo3 import ALGOS
+except ImportError as error:
+    raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
 from sb3_cchain.checkpoint import check_model_file
 from sb3_cchain.methods.registry import REGISTRY
@@ -110,7 +114,7 @@ def run_script(name: str) -> None:
     that draw for every command.
 
     :param name: Name of the command, which is also ``sys.argv[1]``
-    :raises ImportError: When the command draws and the libraries for it are not installed
+    :raises SystemExit: When the command draws and the libraries for it are not installed
     """
     del sys.argv[1]
     if name == "train":
@@ -121,7 +125,7 @@ def run_script(name: str) -> None:
         try:
             from rl_zoo3 import plots
         except ImportError as error:
-            raise ImportError(f'{name} needs the libraries that draw ({error}): pip install "sb3-cchain[plots]"') from error
+            sys.exit(f'{name} needs the libraries that draw ({error}): pip install "sb3-cchain[plots]"')
         run = getattr(plots, name)
     run()
 
