@@ -132,7 +132,7 @@ def test_c_chain_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max
 def test_equals_a_loop_that_copies_the_network(env_id):
     arguments = dict(SETTINGS, target_churn_ratio=0.01, churn_warmup=20, churn_window=50, gradient_steps=1)
     copying = learn_in_double_precision(DeepCopyDQN, 500, env_id, **arguments)
-    ours = learn_in_double_precision(partial(CChainDQN, loss="mse"), 500, env_id, **arguments)
+    ours = learn_in_double_precision(partial(CChainDQN, loss="mse", churn_coef="auto_50"), 500, env_id, **arguments)
     assert ours._n_updates == copying._n_updates == 225
     for name, parameter in ours.policy.named_parameters():
         assert th.allclose(parameter, copying.policy.get_parameter(name), rtol=0, atol=1e-9), name

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
@@ -196,8 +197,8 @@ def test_positional_arguments_are_those_of_dqn():
     assert (model.learning_rate, model.buffer_size, model.learning_starts, model.batch_size) == (1e-3, 100, 7, 16)
     assert model.double_q and model.loss == "huber"
     coefficient = model.churn_reducer.coefficient
-    assert (coefficient.target_ratio, coefficient.initial, coefficient.warmup) == (0.01, 50, 10_000)
-    assert len(coefficient.base_losses) == 50_000
+    assert (coefficient.target_ratio, coefficient.initial, coefficient.warmup) == (0.01, 1, 0)
+    assert len(coefficient.base_losses) == 1000
 
 
 @pytest.mark.parametrize("double_q", [False, True])
@@ -283,6 +284,17 @@ def test_adaptive_coefficient_holds_the_ratio():
     expected = 0.3 * coefficient.base_losses.item() / (coefficient.churn_losses.item() + 1e-8)
     assert coefficient.value == pytest.approx(expected)
     assert coefficient.base_losses.item() == pytest.approx(model.logger.name_to_value["train/loss"])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_defaults_hold_the_ratio_at_any_scale_of_the_rewards(scale):
+    """From the first updates on."""
+    env = TransformReward(RandomEnv(), lambda reward: scale * reward)
+    model = learn(env, n_timesteps=60, loss="mse")
+    coefficient = model.churn_reducer.coefficient
+    base, churn = coefficient.base_losses.sum().item(), coefficient.churn_losses.sum().item()
+    assert coefficient.n_seen == 39  # 40 updates, of which the first has no churn loss
+    assert coefficient.value == pytest.approx(0.01 * base / (churn + 39e-8))
 
 
 def test_tensorboard_names(tmp_path):

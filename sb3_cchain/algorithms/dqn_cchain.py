@@ -22,19 +22,23 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     Paper: https://arxiv.org/abs/2506.00592 (Tang et al., ICML 2025)
 
     It is :class:`~sb3_cchain.DoubleDQN`, which is SB3's :class:`~stable_baselines3.DQN` with all of its arguments, plus
-    λ·L_churn in the loss of each update, where L_churn is the change that the update before made to the Q-network: the mean
+    λ·L_churn in the loss of each update. L_churn is the change that the previous update made to the Q-network: the mean
     squared change of all action values on an independent sample of the replay buffer.
 
     Deviation from the code released with the paper: the reference batch is drawn, and the old outputs are computed, before
     the update instead of by a copy of the network after it.
+
+    The defaults depend on no scale: λ adapts from the first updates on. The paper's values for MinAtar, ``"auto_50"``, a warm-up
+    of 10 000 and a window of 50 000 updates, are in the YAML file of the package; elsewhere a λ of 50 can be so strong that
+    nothing is learned.
 
     :param args: Arguments of DoubleDQN
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
         ``target_churn_ratio`` times the TD loss, or ``"auto_50"`` to use 50 (as the released code) instead of 1 during the
         warm-up. With 0 it is DoubleDQN, to the bit.
     :param target_churn_ratio: β, the size of λ·L_churn relative to the TD loss. ``"auto"`` is the paper's 0.01.
-    :param churn_warmup: Calls of ``train()`` until λ adapts: gradient updates, where ``gradient_steps=1``
-    :param churn_window: Calls of ``train()`` that the running means of both losses go over
+    :param churn_warmup: Gradient updates until λ adapts; with 0 it adapts after the first churn loss
+    :param churn_window: Gradient updates that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes
     :param kwargs: Keyword arguments of DoubleDQN
@@ -44,9 +48,9 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     def __init__(
         self,
         *args: Any,
-        churn_coef: float | str = "auto_50",
-        churn_warmup: int = 10_000,
-        churn_window: int = 50_000,
+        churn_coef: float | str = "auto",
+        churn_warmup: int = 0,
+        churn_window: int = 1000,
         **kwargs: Any,
     ):
         super().__init__(*args, churn_coef=churn_coef, churn_warmup=churn_warmup, churn_window=churn_window, **kwargs)
