@@ -1,9 +1,9 @@
-"""Activation functions: which of torch's modules are, and concatenated ReLU."""
+"""Activation functions: a list of those of torch, and concatenated ReLU."""
 
 import torch as th
 from torch import nn
 
-# Of each entry by itself. Dropout is none: it does nothing to a policy that acts.
+# They act on each entry alone. Dropout is not listed: it does nothing while a policy acts.
 ELEMENTWISE_ACTIVATIONS = (
     nn.CELU,
     nn.ELU,
@@ -21,14 +21,14 @@ ELEMENTWISE_ACTIVATIONS = (
     nn.Tanh,
 )
 
-# Those whose units are off, and pass no gradient, for inputs below 0
+# Their units are off, and pass no gradient, for inputs below 0
 RECTIFIERS = (nn.ReLU, nn.ReLU6)
 
 
 class CReLU(nn.Module):
     """
-    Concatenated ReLU, ``[relu(x), relu(-x)]``: twice as many features as units, of which a unit's one or other is active
-    unless its output is zero.
+    Concatenated ReLU, ``[relu(x), relu(-x)]``: twice as many features as units. One of the two features of a
+    unit is active unless the unit's output is zero.
 
     Shang et al. (ICML 2016), https://arxiv.org/abs/1603.05201; against the loss of plasticity: Abbas et al. (CoLLAs 2023),
     https://arxiv.org/abs/2303.07507.

@@ -9,7 +9,7 @@ from torch import nn
 
 class _ImageExtractor(BaseFeaturesExtractor):
     """
-    Convolutions, and what follows them, on images of either layout.
+    Convolutions and linear layers on images of either layout.
 
     :param observation_space: ``Box`` of shape (height, width, channels), of any dtype; or an image that SB3 has transposed to
         (channels, height, width)
@@ -80,11 +80,11 @@ class ImpalaCNN(_ImageExtractor):
     """
     The residual network of IMPALA (https://arxiv.org/abs/1802.01561, Figure 3, without its LSTM): three blocks, each of a 3×3
     convolution, a 3×3 max-pooling that halves height and width, and two residual blocks; then ReLU, a linear layer and ReLU.
-    The weights are initialised after Xavier (uniform, gain 1) and the biases with zero, as in the C-CHAIN paper.
+    The weights have Xavier's initialisation (uniform, gain 1) and the biases with zero, as in the C-CHAIN paper.
 
     Give it as ``features_extractor_class`` to any policy, with ``net_arch=[]`` to have nothing between the features and the
     outputs. For PPO and A2C take :class:`~sb3_cchain.networks.ImpalaPolicy`: their policies initialise the features
-    anew.
+    again.
 
     :param observation_space: ``Box`` of shape (height, width, channels), of any dtype; or an image that SB3 has transposed to
         (channels, height, width)
@@ -123,7 +123,7 @@ class ImpalaCNN(_ImageExtractor):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw the weights anew."""
+        """Draw new weights."""
         for module in self.modules():
             if isinstance(module, (nn.Conv2d, nn.Linear)):
                 nn.init.xavier_uniform_(module.weight)

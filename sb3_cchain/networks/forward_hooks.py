@@ -1,4 +1,4 @@
-"""Watching modules at work."""
+"""Forward hooks on several modules for a while."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,4 +1,4 @@
-"""Policies."""
+"""The policy of the ProcGen experiments."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Where the optimisers of a Stable-Baselines3 model are."""
+"""The optimisers of a Stable-Baselines3 model, by name."""
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm

@@ -1,4 +1,4 @@
-"""What the networks of any policy get: a batch of observations and, where they are recurrent, a memory."""
+"""What the networks of a policy take in: a batch of observations and, when they are recurrent, a memory."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def empty_memory(policy: Any, observations: PyTorchObs) -> tuple[th.Tensor, th.T
     """
     :param policy: A recurrent policy of sb3-contrib
     :param observations: Batch of observations
-    :return: Hidden state and cell state of its LSTM, were each of them an episode's first
+    :return: Hidden state and cell state of its LSTM at the beginning of an episode, for each observation
     """
     n_layers, _, size = policy.lstm_hidden_state_shape
     zeros = th.zeros(n_layers, n_observations(observations), size, device=policy.device)
