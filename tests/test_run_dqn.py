@@ -168,7 +168,7 @@ class GenerousBuffer(ReplayBuffer):
 
 
 @pytest.mark.parametrize("double_q", [False, True])
-def test_a_replay_buffer_of_ones_own(double_q):
+def test_a_custom_replay_buffer(double_q):
     model = learn(replay_buffer_class=GenerousBuffer, double_q=double_q)
     assert_churn_was_reduced(model)
     assert len(model.churn_reducer.reference) == 16
