@@ -60,8 +60,6 @@ class ChurnReducer(nn.Module):
         self.old_outputs: th.Tensor | None = None
         # The churn loss of each update since the last `end_iteration()`
         self.losses: list[float] = []
-        # The outputs on the reference batch before and after the last update that was measured, without gradient
-        self.last_change: tuple[th.Tensor, th.Tensor] | None = None
         # Over the samples since the last `end_iteration()`: their number, and the sum of the loss beyond that of no change
         self._n_samples, self._churn_sum = 0, 0.0
 
@@ -98,7 +96,6 @@ class ChurnReducer(nn.Module):
         loss = churn_loss.item()
         _check_finite(loss, self._coef, th.finfo(churn_loss.dtype).max)
         self.losses.append(loss)
-        self.last_change = self.old_outputs, new_outputs.detach()
         n_samples = len(new_outputs)
         self._n_samples += n_samples
         self._churn_sum += n_samples * (loss - self.divergence(self.old_outputs, self.old_outputs).item())
@@ -138,15 +135,9 @@ class ChurnReducer(nn.Module):
         if losses:
             self.coefficient.update(base_loss, sum(losses) / len(losses))
 
-    @property
-    def compared(self) -> list[tuple[th.Tensor, th.Tensor]]:
-        """The last change in a list, for the code of DQN."""
-        return [] if self.last_change is None else [self.last_change]
-
     def discard_losses(self) -> None:
         """Forget the losses since the last ``end_iteration()``, as when training was interrupted in between."""
         self.losses = []
-        self.last_change = None
         self._n_samples, self._churn_sum = 0, 0.0
 
     def forget_reference(self) -> None:
