@@ -103,7 +103,7 @@ YAML = [pytest.param(code, id=f"{name_of(page)}-{i}") for page in PAGES for i, c
 @pytest.mark.parametrize("code", YAML)
 def test_yaml_trains_with_the_stock_rl_zoo(code, short_rollouts, monkeypatch):
     settings = yaml.safe_load(code)
-    if not any("/" in key for key in settings):  # not an entry but a part of one
+    if not all(isinstance(value, dict) for value in settings.values()):  # not entries but a part of one
         settings = {"Continual/Acrobot-v1": {"n_timesteps": 256, "policy": "MlpPolicy", **settings}}
         code = yaml.safe_dump(settings)
     Path("settings.yml").write_text(code)
@@ -116,7 +116,7 @@ def test_yaml_trains_with_the_stock_rl_zoo(code, short_rollouts, monkeypatch):
         ]
         monkeypatch.setattr(sys, "argv", ["train", *arguments])
         train()
-    assert list(short_rollouts.glob("logs/*/*/Continual-*.zip"))
+    assert list(short_rollouts.glob("logs/*/*/*-v*.zip"))
 
 
 class ParsedError(Exception):
