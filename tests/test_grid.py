@@ -691,6 +691,7 @@ def test_a_cluster_of_two_nodes_loses_one(tmp_path, cluster, ray_backend):
     accident.start()
     (failure,) = complete(runs, results, logs, ray_backend, silent())
     accident.join()
+    cluster.add_node(num_cpus=1)  # for other tests
     assert len(raylets) == 2
     assert seeds_of_results(results) == [0, 1, 2]
     n_attempts = Counter({run.seed: len(attempts(run, logs)) for run in runs})

@@ -497,7 +497,7 @@ def test_whole_report(whole_report):
     assert "- Not run: Continual ProcGen, Continual DeepMind Control, Continual MinAtar." in text
     assert "5 of the paper's 24 cells have runs. Of the 4 with more than one seed, 0 agree with the paper." in text
     assert "| Acrobot-v1 | 2 × 100 | 10 × 160,000 |" in text and "not expected to agree" in text
-    assert "Left out, as they do not have runs in all of them: Oracle, TRAC, Weight clipping, L2 Init." in text
+    assert "Left out, because they do not have runs in all of them: Oracle, TRAC, Weight clipping, L2 Init." in text
     assert "| PPO | 1.00 [1.00, 1.00] | 2 of 2 | 2 of 2 |" in text
     assert "9 runs, 9.0 hours" in text and not re.search(r"\bnan\b|None", text)
     pictures = sorted(re.findall(r"\]\((pictures/.*?)\)", text))
@@ -524,7 +524,7 @@ def test_report_of_a_method_alone(tmp_path, no_drawing):
     write(tmp_path, "trac", [[-90], []])
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
-    assert f"Left out, as their J(T) is not defined:\n\n- {ACROBOT}, trac, seed 0: no return in task 1" in text
+    assert f"Left out, because their J(T) is not defined:\n\n- {ACROBOT}, trac, seed 0: no return in task 1" in text
     assert "Over the environments" not in text and "Neural" not in text
 
 
@@ -545,14 +545,13 @@ def test_hyperparameters_are_told(whole_report, tmp_path, no_drawing):
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
     assert "- TRAC (Acrobot-v1): `learning_rate: 1.0`" in text
-    assert "that are shipped now:**\n\n- Acrobot-v1, TRAC, seed 0\n\n" in text
+    assert "than are shipped now:**\n\n- Acrobot-v1, TRAC, seed 0\n\n" in text
 
 
 def test_seeds_that_lack_are_told(whole_report):
     text = whole_report[0]
     assert (
-        "Not all of the seeds 0 1 finished, for want of time or because they failed:\n\n- 0 alone: Acrobot-v1 Oracle\n\n"
-        in text
+        "Not all of the seeds 0 1 finished, because time ran out or they failed:\n\n- 0 alone: Acrobot-v1 Oracle\n\n" in text
     )
 
 
@@ -642,6 +641,16 @@ def test_a_run_that_cannot_be_read_is_named_and_left_out(tmp_path, monkeypatch, 
     text = (tmp_path / "smoke" / "report.md").read_text()
     assert "1 finished runs of a single seed" in text
     assert f"These are left out:\n\n- {escaped(path)}" in text
+
+
+def test_a_suite_that_the_paper_does_not_have_is_left_out(tmp_path, monkeypatch, no_drawing):
+    write(tmp_path, "cchain", [[-90], [-100]])
+    path = write(tmp_path, "cchain", [[-90], [-100]], "Continual/Walker-v0", suite="dmc")
+    tables = read_tables()
+    del tables["dmc"]
+    monkeypatch.setattr("benchmarks.report.document.read_tables", lambda: tables)
+    reasons = write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    assert reasons == [f"{path}: the paper has no Continual/Walker-v0 in dmc"]
 
 
 def test_a_report_of_nothing_is_an_error(tmp_path, monkeypatch, capsys):

@@ -34,9 +34,9 @@ PICTURES = "pictures"
 INTRODUCTION = """# The paper's tables, reproduced: budget {budget}
 
 The numbers of this page are made from {n_runs} finished runs{seeds}, beside those printed in *Mitigating Plasticity Loss in
-Continual Reinforcement Learning by Reducing Churn* (Tang et al., ICML 2025). Every finished run of this budget that is in
-the folder of results is in; the runs of a cell differ in their seed alone. The hyperparameters are those shipped at the
-time, which the `run.json` of each run holds.
+Continual Reinforcement Learning by Reducing Churn* (Tang et al., ICML 2025). All finished runs of this budget in
+the results folder are included; the runs of a cell differ in their seed alone. The hyperparameters are those shipped when
+the runs were made; the `run.json` of each run has them.
 
 {suites}
 
@@ -59,20 +59,20 @@ time, which the `run.json` of each run holds.
 - **Bold** is the best mean, <ins>underlined</ins> the second, without the Oracle, and no second of two methods, as the paper
   marks; of a single method nothing is marked. Marks go by the numbers, in the paper's rows too, and among the cells that are
   there.
-- **{missing}** is missing: no finished run, or not in the paper. Nothing is filled in. *seeds* are all that finished.
+- **{missing}** is missing: no finished run, or not in the paper. Nothing is filled in. *seeds* lists all that finished.
 - The **aggregate** is the sum of the environments' means, as the paper's "Agg. Score"; missing unless all of them are there.
-- *PPO*, in MinAtar *Double DQN*, is what the paper calls Vanilla. *Oracle* starts anew at each task.
-- **†** the seeds of the cell were not all run with the same versions of the packages; which is said below the table. The
+- *PPO*, in MinAtar *Double DQN*, is what the paper calls Vanilla. *Oracle* starts each task with fresh networks.
+- **†** the seeds of the cell were not all run with the same versions of the packages; a note below the table says which. The
   commits of this repository that the runs were made at are listed at the end."""
 
 
 NORMALIZATION = """\
 Scores are J(T), normalised in each environment so that 0 is the lowest and 1 the highest of the paper's means of all its
-methods, the Oracle among them: a scale that the runs here do not move. (From the paper's Vanilla to its Oracle is no scale:
-they lie too close together in Leaper, and the other way round in Quadruped.) The optimality gap is what is missing to 1, on
-average, scores above counting as 1: less is better. In brackets the 95 % interval, bootstrapped over seeds within each
-environment. An environment in which the paper's means lie close together, as in Leaper, moves the mean more than others do,
-and the IQM less."""
+methods, the Oracle among them: a scale that the runs here do not move. (The paper's Vanilla and Oracle would make no
+scale: they are too close together in Leaper, and in the opposite order in Quadruped.) The optimality gap is what is missing
+to 1, on average, scores above counting as 1: less is better. In brackets the 95 % interval, bootstrapped over seeds within
+each environment. An environment in which the paper's means lie close together, as in Leaper, moves the mean more than others
+do, and the IQM less."""
 
 IMPROVEMENT = """\
 The probability of improvement is that a run of C-CHAIN has a higher J(T) than one of the other method, mean over the
@@ -101,7 +101,7 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
     by_suite: dict[str, list[Result]] = {suite: [] for suite in tables}
     left_out = list(left_out)
     for result in results:
-        if result.env_id not in tables[result.suite].lengths:
+        if result.suite not in tables or result.env_id not in tables[result.suite].lengths:
             left_out.append(f"{result.path}: the paper has no {result.env_id} in {result.suite}")
         elif result.variant is not None or result.overrides:
             left_out.append(f"{result.path}: not under the shipped hyperparameters, but with {', '.join(result.overrides)}")
@@ -159,7 +159,7 @@ def _suite_section(suite: str, results: Sequence[Result], paper: Table, pictures
     parts = [f"## {SUITES[suite].title}", lengths_table(results, paper), results_table(suite, cells, paper)]
     parts += _notes(suite, cells, paper, left_out)
     if marks := mark_differences(suite, paper):
-        parts.append("Where the paper's own marks or sums are not those of its numbers:\n\n" + "\n".join(marks))
+        parts.append("Where the paper's own marks or sums do not follow from its numbers:\n\n" + "\n".join(marks))
     parts += _hyperparameters_section(suite, results, paper)
     parts += _reliable_section(suite, cells, paper, pictures)
     parts += _curves_section(suite, results, paper, pictures)
@@ -192,9 +192,11 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
             fewer.setdefault(seeds_text(cell.seeds), []).append(f"{short_name(env_id)} {method_label(suite, method)}")
     if fewer:
         lines = "\n".join(f"- {seeds} alone: {', '.join(names)}" for seeds, names in fewer.items())
-        notes.append(f"Not all of the seeds {seeds_text(most)} finished, for want of time or because they failed:\n\n{lines}")
+        notes.append(f"Not all of the seeds {seeds_text(most)} finished, because time ran out or they failed:\n\n{lines}")
     if left_out:
-        notes.append("Left out, as their J(T) is not defined:\n\n" + "\n".join(f"- {escaped(reason)}" for reason in left_out))
+        notes.append(
+            "Left out, because their J(T) is not defined:\n\n" + "\n".join(f"- {escaped(reason)}" for reason in left_out)
+        )
     return notes
 
 
@@ -206,12 +208,12 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
         vanilla = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
         for method, hyperparameters in {run.method: run.hyperparameters for run in runs if run.method != "vanilla"}.items():
             differing = [code(f"{name}: {value}") for name, value in hyperparameters.items() if vanilla.get(name) != value]
-            key = method_label(suite, method), ", ".join(differing) or "nothing in the settings"
+            key = method_label(suite, method), ", ".join(differing) or "not in the settings"
             differences.setdefault(key, []).append(short_name(env_id))
     lines = [f"- {label} ({', '.join(names)}): {differing}" for (label, differing), names in differences.items()]
     parts = [
         "### Hyperparameters",
-        f"What the settings of each method have beside {method_label(suite, 'vanilla')}'s, or instead:",
+        f"How the settings of each method differ from {method_label(suite, 'vanilla')}'s:",
         "\n".join(lines) if lines else "Nothing else was run.",
     ]
     others = [
@@ -220,7 +222,7 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
         if result.hyperparameters != as_json(shipped_hyperparameters(result.algo, result.env_id))
     ]
     if others:
-        parts += ["**Not under the hyperparameters that are shipped now:**", "\n".join(others)]
+        parts += ["**Made with other hyperparameters than are shipped now:**", "\n".join(others)]
     return parts
 
 
@@ -242,7 +244,7 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Picture
     without = [method_label(suite, method) for method in table_methods(cells, paper) if method not in scores]
     words = [
         f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and C-CHAIN both have runs. "
-        + (f"Left out, as they do not have runs in all of them: {', '.join(without)}. " if without else "")
+        + (f"Left out, because they do not have runs in all of them: {', '.join(without)}. " if without else "")
         + NORMALIZATION
     ]
     shown = []

@@ -94,6 +94,7 @@ def plot_learning_curves(
         above: dict[str, Any] = dict(ha="center", va="bottom", transform=panels[task].get_xaxis_transform())
         panels[task].text(middle, 1.01, name, parse_math=False, **above)
     panels[0].set_ylabel(RETURNS.label)
+    panels[n_tasks // 2].set_xlabel("environment steps")
     if title:
         figure.suptitle(title, parse_math=False)
     _save(figure, panels, path)
@@ -133,6 +134,7 @@ def plot_quantities(
             panel.set_ylim(bottom=max(1e-4 * greatest, panel.get_ylim()[0]))
     if title:
         figure.suptitle(title)
+    panels[max(len(panels) - 2, 0)].set_xlabel("environment steps")  # in the middle of the last row
     _save(figure, panels, path)
 
 
@@ -198,10 +200,10 @@ def _draw(
 
 def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
     """With one legend for all panels."""
-    panels[len(panels) // 2].set_xlabel("environment steps")
-    legend = {}
+    legend: dict[str, Any] = {}
     for panel in panels:
-        legend.update({label: handle for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)})
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            legend.setdefault(label, handle)
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 5), frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
