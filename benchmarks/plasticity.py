@@ -11,16 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.grid.executor import train_all
-from benchmarks.grid.run import Run, make_run, shipped_hyperparameters
+from benchmarks.grid.run import Run, make_run, shipped_hyperparameters, suite_methods
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.figures import plot_quantities
 from benchmarks.report.quantities import PLASTICITY
 from benchmarks.report.task_tables import quantities_table
-from sb3_cchain.methods.registry import find_method
 
 SUITE = "gym_control"
 MONITORS = ("sb3_cchain.ChurnMonitor", "sb3_cchain.analysis.NTKCallback", "sb3_cchain.analysis.NetworkHealth")
-PPO, CCHAIN = (find_method(name, SUITE) for name in ("vanilla", "cchain"))
+PPO, CCHAIN = (suite_methods(SUITE)[name] for name in ("vanilla", "cchain"))
 
 # What is compared: label and colour of each, and how it differs from the shipped hyperparameters
 LINES = {

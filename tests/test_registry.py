@@ -12,23 +12,18 @@ from matplotlib.colors import to_rgb
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 
+from benchmarks.grid.run import suite_methods
+from benchmarks.grid.suites import SUITES
 from sb3_cchain import methods
 from sb3_cchain.algorithms import CChainDQN, CChainPPO
 from sb3_cchain.methods import OptimizerMetrics, OptimizerWrapper, Penalty
-from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, find_method
+from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY
 from tests.method_models import go_on, make_env, make_method
 
 ROOT = Path(__file__).parent.parent
-SUITES = {suite for method in REGISTRY for suite in method.suites}
 ROWS = pytest.mark.parametrize("method", REGISTRY, ids=lambda method: method.algo)
 # Classes of `sb3_cchain.methods` that are parts of methods
 PARTS = {OptimizerMetrics, OptimizerWrapper, Penalty}
-ENV_IDS = {
-    "gym_control": ("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "MountainCar-v0"),
-    "procgen": ("CoinRun-v0", "Starpilot-v0"),
-    "dmc": ("Walker-v0", "Quadruped-v0", "Dog-v0"),
-    "minatar": ("MinAtar-v0",),
-}
 
 
 def yaml_text(method):
@@ -54,7 +49,7 @@ def path_of(cls):
 def test_yaml_has_settings_for_its_suites(method):
     covered = settings(method)
     for suite in method.suites or ("gym_control",):
-        missing = [name for name in ENV_IDS[suite] if f"Continual/{name}" not in covered]
+        missing = set(SUITES[suite].env_ids) - covered.keys()
         assert not missing, f"{method.algo}.yml has no settings for {missing}"
     for values in covered.values():
         assert {"policy", "n_timesteps"} <= values.keys()
@@ -122,24 +117,23 @@ def test_names_and_colours():
         assert len({row.name for row in rows}) == len({row.label for row in rows}) == len(rows)
 
 
-@pytest.mark.parametrize("suite", sorted(SUITES))
-def test_rows_are_found_by_name_and_suite(suite):
-    for row in REGISTRY:
-        if suite in row.suites:
-            assert find_method(row.name, suite) is row
-    with pytest.raises(ValueError, match=f"no method 'nothing' for the algorithm of '{suite}'"):
-        find_method("nothing", suite)
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_suite_has_the_methods_of_its_algorithm(suite):
+    methods = suite_methods(suite)
+    assert {"vanilla", "cchain"} <= methods.keys()
+    assert methods["vanilla"].algo == SUITES[suite].algo
+    rows = [row for row in REGISTRY if suite in row.suites]
+    assert [methods[row.name] for row in rows] == rows
+    assert all(issubclass(method.algorithm, methods["vanilla"].algorithm) for method in methods.values())
 
 
-def test_methods_outside_the_paper_are_found_for_their_algorithm():
-    assert find_method("parseval", "gym_control").algo == "ppo_parseval"
-    with pytest.raises(ValueError, match=r"'parseval' for the algorithm of 'minatar', Double DQN"):
-        find_method("parseval", "minatar")
+def test_methods_outside_the_paper_belong_to_the_suites_of_their_algorithm():
+    assert suite_methods("gym_control")["parseval"].algo == "ppo_parseval"
+    assert "parseval" not in suite_methods("minatar")
 
 
-def test_a_suite_that_no_row_names():
-    with pytest.raises(ValueError, match=r"`suite` must be one of .*'gym_control'.*, got 'atari'"):
-        find_method("trac", "atari")
+def test_rows_name_suites_that_there_are():
+    assert {suite for row in REGISTRY for suite in row.suites} <= SUITES.keys()
 
 
 BAD = {

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from benchmarks.grid.suites import SUITES, paper_length
-from sb3_cchain.methods.registry import METHOD_NAMES, REGISTRY, Method, find_method
+from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,7 +56,7 @@ class Run:
     @property
     def algo(self) -> str:
         """The method's name on the command line."""
-        return find_method(self.method, self.suite).algo
+        return suite_methods(self.suite)[self.method].algo
 
     @property
     def total_steps(self) -> int:
@@ -155,9 +155,10 @@ def make_run(
 def paper_methods(suite: str) -> list[str]:
     """
     :param suite: Name of a suite
-    :return: The methods that the paper compares in it, in the order of the tables
+    :return: The methods that the paper compares in it, in the order of the tables; all that there are for a suite of others
     """
-    return [method.name for method in REGISTRY if suite in method.suites]
+    methods = suite_methods(suite)
+    return [name for name, method in methods.items() if suite in method.suites] or list(methods)
 
 
 def suite_methods(suite: str) -> dict[str, Method]:
@@ -165,13 +166,8 @@ def suite_methods(suite: str) -> dict[str, Method]:
     :param suite: Name of a suite
     :return: By name, in the order of the tables, all methods that there are for the suite's algorithm
     """
-    methods = {}
-    for name in METHOD_NAMES:
-        try:
-            methods[name] = find_method(name, suite)
-        except ValueError:
-            pass  # of another algorithm
-    return methods
+    algorithm = BY_ALGO[SUITES[suite].algo].algorithm
+    return {method.name: method for method in REGISTRY if issubclass(method.algorithm, algorithm)}
 
 
 def available_methods(suite: str, env_id: str) -> list[str]:

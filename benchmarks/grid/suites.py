@@ -33,6 +33,7 @@ class Suite:
     :param rates: Measured environment steps per second on one core, by method; of methods that are missing, Vanilla's
     :param smoke_steps: Environment steps per task of a smoke run, enough for a return in each of two tasks
     :param demo: What the demo shows
+    :param algo: Name on the command line of its algorithm without churn reduction
     :param n_paper_seeds: Number of seeds in the paper
     :param reduce_length: From the paper's number of tasks and steps per task to those of the budget ``reduced``
     :param evaluates: Whether the returns that count are those of greedy evaluations, not of training
@@ -47,6 +48,7 @@ class Suite:
     rates: Mapping[str, float]
     smoke_steps: int
     demo: Demo
+    algo: str = "ppo"
     n_paper_seeds: int = 6
     # All tasks, a tenth of their lengths; not claimed to be long enough for the paper's effects
     reduce_length: Callable[[int, int], tuple[int, int]] = lambda n_tasks, steps: (n_tasks, steps // 10)
@@ -119,6 +121,7 @@ SUITES = {
             "After each switch it is another game. The first 10 000 actions in each are random. The returns are those of "
             "greedy evaluations. Learning takes 50 times longer than this.",
         ),
+        algo="double_dqn",
         n_paper_seeds=12,
         evaluates=True,
         own_scales=True,

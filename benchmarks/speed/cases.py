@@ -15,7 +15,7 @@ from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.methods import ReDo
-from sb3_cchain.methods.registry import REGISTRY, Method, find_method
+from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
 NOT_MODEL_ARGUMENTS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}
@@ -107,7 +107,7 @@ def related() -> Case:
         return model, [callback(**EACH_ITERATION.get(callback, {})) for callback in method.callbacks]
 
     models = {method.label: make(method) for method in REGISTRY if issubclass(method.algorithm, PPO)}
-    vanilla = find_method("vanilla", "gym_control").label
+    vanilla = BY_ALGO["ppo"].label
 
     # Callbacks act around train(), some only between the iterations of a learn(). No task switches in between.
     def iterations(made: Any) -> None:

@@ -142,20 +142,3 @@ REGISTRY = (
 
 METHOD_NAMES = tuple(dict.fromkeys(method.name for method in REGISTRY))
 BY_ALGO = {method.algo: method for method in REGISTRY}
-
-
-def find_method(name: str, suite: str) -> Method:
-    """
-    :param name: Name of a method
-    :param suite: Name of a suite
-    :return: The row of the method for that suite's algorithm
-    :raises ValueError: When no row names the suite, or the method has no row for its algorithm
-    """
-    suites = {suite for method in REGISTRY for suite in method.suites}
-    if suite not in suites:
-        raise ValueError(f"`suite` must be one of {sorted(suites)}, got {suite!r}")
-    vanilla = next(method for method in REGISTRY if method.name == "vanilla" and suite in method.suites)
-    for method in REGISTRY:
-        if method.name == name and (suite in method.suites or issubclass(method.algorithm, vanilla.algorithm)):
-            return method
-    raise ValueError(f"There is no method {name!r} for the algorithm of {suite!r}, {vanilla.label}")
