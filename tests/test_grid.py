@@ -685,6 +685,8 @@ def test_a_cluster_of_two_nodes_loses_one(tmp_path, cluster, ray_backend):
         two = wait_for(lambda: len(found := trainings(logs)) == 2 and found, "two trainings at once")
         raylets.update(parent_process(worker) for worker in two.values())
         cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
+        # Its training could still end and be heard of before
+        wait_for(lambda: not set(two) <= set(trainings(logs)), "end of the lost training", 60)
         (tmp_path / "fake" / "go").touch()
 
     accident = threading.Thread(target=lose_one)
