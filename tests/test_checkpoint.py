@@ -154,7 +154,7 @@ def test_statistics_are_loaded_and_settings_kept(cls, tmp_path):
     assert np.array_equal(loaded.obs_rms.mean, saved.obs_rms.mean) and loaded.ret_rms.var == saved.ret_rms.var
     assert loaded.clip_obs == 5.0 and loaded.venv is not None
     if cls is TaskVecNormalize:
-        assert loaded._statistics_task == 1
+        assert loaded._switch.task_id == 1
     with pytest.raises(ValueError, match=r"are of norm_obs=True, but training has norm_obs=False"):
         load_statistics(wrap(norm_obs=False), tmp_path / "vecnormalize.pkl")
     with pytest.raises(AssertionError, match="spaces must have the same shape"):  # SB3's

@@ -134,7 +134,7 @@ def optimizer(name, arguments):
     return f"optimizer_class=get_class_by_name('sb3_cchain.methods.{name}'), optimizer_kwargs=dict({arguments})"
 
 
-# The callbacks that are added, and what stands for Adam's arguments among those of the policy
+# Of the paper's methods: the callbacks that are added, and what stands for Adam's arguments among those of the policy
 DIFFERENCES = {
     ("ppo_oracle", "gym_control"): ([ORACLE], ADAM),
     ("ppo_oracle", "procgen"): ([ORACLE], ""),
@@ -164,8 +164,32 @@ def parsed(settings):
     return {**settings, "policy_kwargs": ast.dump(expression)}
 
 
+def keywords(settings):
+    """The arguments in ``policy_kwargs``, by name."""
+    call = ast.parse(settings.get("policy_kwargs", "dict()"), mode="eval").body
+    return {keyword.arg: ast.dump(keyword.value) for keyword in call.keywords}
+
+
 @pytest.mark.parametrize("method", METHODS)
-def test_a_method_differs_from_its_algorithm_in_itself_alone(method):
+def test_a_method_differs_from_its_algorithm_in_what_its_row_has(method):
+    row, settings = BY_ALGO[method], shipped_settings(method)
+    vanilla = shipped_settings(base_algo(row))
+    network = {"features_extractor_kwargs", *row.policy_kwargs} if row.policy != "MlpPolicy" else set()
+    allowed = network | ({"optimizer_class", "optimizer_kwargs"} if row.optimizer_class else set())
+    for env_id in (name for name in settings if not name.endswith("-defaults")):
+        own, base = settings[env_id], vanilla[env_id]
+        differing = {name for name in own.keys() | base.keys() if own.get(name) != base.get(name)}
+        assert differing <= {"callback", "policy_kwargs"} | ({"policy"} if network else set())
+        n_base = len(base["callback"])
+        assert own["callback"][:n_base] == base["callback"]
+        added = [entry if isinstance(entry, str) else next(iter(entry)) for entry in own["callback"][n_base:]]
+        assert [name.split(".")[-1] for name in added] == [callback.__name__ for callback in row.callbacks]
+        of_method, of_base = keywords(own), keywords(base)
+        assert {n for n in of_method.keys() | of_base.keys() if of_method.get(n) != of_base.get(n)} <= allowed
+
+
+@pytest.mark.parametrize("method", dict.fromkeys(method for method, _ in DIFFERENCES))
+def test_the_papers_methods_have_these_settings(method):
     settings, vanilla = shipped_settings(method), shipped_settings(base_algo(BY_ALGO[method]))
     expected = {}
     for suite in (suite for name, suite in DIFFERENCES if name == method):
@@ -193,7 +217,12 @@ METHOD_ROLLOUTS = {
 }
 
 
-@pytest.mark.parametrize("method, suite", [key for key in DIFFERENCES if key[1] != "minatar"])
+ROW_SUITES = [
+    (method, suite) for method in METHODS for suite in BY_ALGO[method].suites or ("gym_control",) if suite in METHOD_ROLLOUTS
+]
+
+
+@pytest.mark.parametrize("method, suite", ROW_SUITES)
 @pytest.mark.filterwarnings("ignore")
 def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, method, suite):
     if sys.version_info >= (3, 13) and suite in ("procgen", "dmc"):
@@ -205,8 +234,7 @@ def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, 
     model = PPO.load(path, device="cpu")
     assert type(model) is PPO and model.num_timesteps == 2 * n_steps and model._n_updates == 2
     optimizer = model.policy.optimizer
-    names = {"ppo_trac": "TRAC", "ppo_weight_clipping": "WeightClipping", "ppo_l2_init": "L2Init"}
-    assert type(optimizer).__name__ == names.get(method, "Adam")
+    assert type(optimizer) is (BY_ALGO[method].optimizer_class or th.optim.Adam)
     assert optimizer.param_groups[0]["eps"] == (1e-8 if suite == "gym_control" or method == "ppo_trac" else 1e-5)
     # Two updates for each task, or those since the reset
     n_updates = 2 if method in ("ppo_oracle", "ppo_adam_rel") else 4

@@ -110,7 +110,6 @@ def load_statistics(normalize: VecNormalize, path: str | Path) -> None:
             f"The statistics in {path} are of norm_obs={saved.norm_obs}, but training has norm_obs={normalize.norm_obs}. "
             "Normalise as the model was trained"
         )
-    # TaskVecNormalize also knows the task that its statistics belong to
-    for name in ("obs_rms", "ret_rms", "_statistics_task"):
+    for name in getattr(normalize, "statistics", {"obs_rms", "ret_rms"}):
         if name in vars(saved):
             setattr(normalize, name, vars(saved)[name])

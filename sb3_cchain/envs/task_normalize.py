@@ -1,7 +1,7 @@
 """Normalisation whose statistics restart at each task."""
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,9 @@ class TaskVecNormalize(VecNormalize):
     :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward`` or ``restart`` is not a boolean
     """
 
+    # Attributes that a saved TaskVecNormalize goes on with; `_switch` knows the task that the statistics are of
+    statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch"})
+
     def __init__(
         self,
         venv: VecEnv,
@@ -64,7 +67,7 @@ class TaskVecNormalize(VecNormalize):
             check_bool(name, flag)
         super().__init__(venv, training, norm_obs, norm_reward, clip_obs, clip_reward, gamma, epsilon, norm_obs_keys)
         self.restart = restart
-        # Knows the task that the statistics are of. None before the first step, and where tasks have no number
+        # Of no task before the first step, and where tasks have no number
         self._switch = TaskSwitch()
         self._before_reset: dict[str, Any] | None = None
 
@@ -80,7 +83,7 @@ class TaskVecNormalize(VecNormalize):
             if self._before_reset is not None:
                 self.__dict__.update(self._before_reset)
             # Without normalisation of observations there is no `obs_rms`
-            names = {"obs_rms", "ret_rms", "_switch"}.intersection(self.__dict__)
+            names = self.statistics.intersection(self.__dict__)
             self._before_reset = {name: deepcopy(self.__dict__[name]) for name in names}
         observation = super().reset()
         if self._enters_task():
