@@ -9,11 +9,12 @@ import torch as th
 import yaml
 from stable_baselines3 import DQN, PPO
 
+from benchmarks.grid.run import suite_methods
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
-from tests.zoo_command import DMC, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, SUITES, command, shipped_settings
+from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, command, shipped_settings
 
 # Algorithms of which RL Zoo has no settings
 NEW_ALGOS = ["ppo_cchain", "dqn_cchain", "double_dqn"]
@@ -28,25 +29,37 @@ def train(folder, algo, env_id, n_steps, *arguments):
     )
 
 
+def algos_of(suite):
+    """Names on the command line of the algorithms that train in a suite, with and without churn reduction."""
+    stock = ["dqn"] if suite == "minatar" else []
+    return [*stock, *(suite_methods(suite)[name].algo for name in ("vanilla", "cchain"))]
+
+
 def test_every_environment_has_settings():
-    continual = {f"Continual/{name}" for name in CONTINUAL_ENVS}
-    assert len(continual) == 24 and {*GYM_CONTROL, *PROCGEN, *DMC, "Continual/MinAtar-v0"} == continual
-    for algos, env_ids in (
-        (("ppo", "ppo_cchain"), {*GYM_CONTROL, *PROCGEN, *DMC}),
-        (("dqn", "double_dqn", "dqn_cchain"), {"Continual/MinAtar-v0"}),
-    ):
-        for algo in algos:
-            assert {key for key in shipped_settings(algo) if not key.endswith("default") and "defaults" not in key} == env_ids
+    papers = ("gym_control", "procgen", "dmc", "minatar")
+    assert sum(len(ENV_IDS[suite]) for suite in papers) == 24
+    assert {f"Continual/{name}" for name in CONTINUAL_ENVS} == {env_id for env_ids in ENV_IDS.values() for env_id in env_ids}
+    covered = {}
+    for suite, env_ids in ENV_IDS.items():
+        for algo in algos_of(suite):
+            covered.setdefault(algo, set()).update(env_ids)
+    for algo, env_ids in covered.items():
+        assert {key for key in shipped_settings(algo) if not key.endswith("default") and "defaults" not in key} == env_ids
     for algo in NEW_ALGOS:
         assert "default" in shipped_settings(algo)
 
 
 # Shorter than the settings', where a rollout of those takes long
+SHORTER = {
+    "procgen": ["n_steps:32", "batch_size:16", "n_epochs:1"],
+    "dmc": ["n_steps:128", "n_epochs:1"],
+    "minatar": ["buffer_size:1000"],
+}
 ROLLOUTS = {
-    **{(algo, env_id): [] for env_id in GYM_CONTROL for algo in ("ppo", "ppo_cchain")},
-    **{(algo, env_id): ["n_steps:32", "batch_size:16", "n_epochs:1"] for env_id in PROCGEN for algo in ("ppo", "ppo_cchain")},
-    **{(algo, env_id): ["n_steps:128", "n_epochs:1"] for env_id in DMC for algo in ("ppo", "ppo_cchain")},
-    **{(algo, "Continual/MinAtar-v0"): ["buffer_size:1000"] for algo in ("dqn", "double_dqn", "dqn_cchain")},
+    (algo, env_id): SHORTER.get(suite, [])
+    for suite, env_ids in ENV_IDS.items()
+    for env_id in env_ids
+    for algo in algos_of(suite)
 }
 
 
@@ -194,7 +207,7 @@ def test_the_papers_methods_have_these_settings(method):
     expected = {}
     for suite in (suite for name, suite in DIFFERENCES if name == method):
         callbacks, arguments = DIFFERENCES[method, suite]
-        for env_id in SUITES[suite]:
+        for env_id in ENV_IDS[suite]:
             env_settings = vanilla[env_id]
             policy_kwargs = env_settings.get("policy_kwargs", f"dict({ADAM})" if arguments else "dict()").replace(
                 ADAM, arguments
@@ -246,7 +259,7 @@ def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, 
 
 @pytest.mark.parametrize("algo", ["ppo_layer_norm", "double_dqn_oracle"])
 def test_a_method_says_which_environments_it_covers(tmp_path, algo):
-    covered = PROCGEN if algo == "ppo_layer_norm" else SUITES["minatar"]
+    covered = PROCGEN if algo == "ppo_layer_norm" else ENV_IDS["minatar"]
     error = f"{algo}.yml has no settings for Continual/Acrobot-v1, only for {', '.join(covered)}. .* -conf FILE$"
     with pytest.raises(SystemExit, match=error):
         train(tmp_path, algo, "Continual/Acrobot-v1", 64)

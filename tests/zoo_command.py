@@ -11,14 +11,12 @@ import rl_zoo3.train
 import yaml
 
 import sb3_cchain.zoo.cli as zoo
-from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from benchmarks.grid.suites import SUITES
 from sb3_cchain.zoo.settings import read_settings
 
 ROOT = Path(__file__).parent.parent
-DMC = ["Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"]
-PROCGEN = [f"Continual/{name}" for name, registration in CONTINUAL_ENVS.items() if "game" in registration.get("kwargs", {})]
-GYM_CONTROL = ["Continual/CartPole-v1", "Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/MountainCar-v0"]
-SUITES = {"gym_control": GYM_CONTROL, "procgen": PROCGEN, "dmc": DMC, "minatar": ["Continual/MinAtar-v0"]}
+ENV_IDS = {name: list(suite.env_ids) for name, suite in SUITES.items()}
+GYM_CONTROL, PROCGEN, DMC = (ENV_IDS[suite] for suite in ("gym_control", "procgen", "dmc"))
 
 FAST = ("--num-threads", "1", "--device", "cpu", "--verbose", "0")
 NO_EVALUATION = ("--eval-freq", "-1")
