@@ -254,8 +254,8 @@ def test_checkers(domain):
         sb3_check_env(env)
     # They recommend bounded observations and actions from -1 to 1; dm_control's own are not
     allowed = ("infinity", "symmetric and normalized", "unmaintained")
-    ours = [str(warning.message) for warning in caught if warning.category is not DeprecationWarning]
-    assert all(any(words in message for words in allowed) for message in ours), ours
+    own = [str(warning.message) for warning in caught if warning.category is not DeprecationWarning]
+    assert all(any(words in message for words in allowed) for message in own), own
 
 
 @needs_dm_control

@@ -257,8 +257,8 @@ def test_distribution_modes():
 
 
 def test_the_sixteen_are_registered():
-    ours = {name for name, entry in CONTINUAL_ENVS.items() if "ContinualProcgen" in entry["entry_point"]}
-    assert ours == {f"{name}-v0" for name in NAMES}
+    own = {name for name, entry in CONTINUAL_ENVS.items() if "ContinualProcgen" in entry["entry_point"]}
+    assert own == {f"{name}-v0" for name in NAMES}
     assert sorted(GAMES) == sorted(NAMES.values()) == sorted(procgen.env.ENV_NAMES)
     for name, game in NAMES.items():
         env = gym.make(f"Continual/{name}-v0")
@@ -396,16 +396,16 @@ def test_frames_of_the_environment():
 @pytest.mark.parametrize("num_threads", [0, 3])
 def test_vectorised_is_the_same_as_single_ones(num_threads):
     kwargs = dict(game="starpilot", n_tasks=3, steps_per_task=[300, 36, 300], first_level=30)
-    ours = ContinualProcgenVecEnv(n_envs=4, num_threads=num_threads, **kwargs)
+    own = ContinualProcgenVecEnv(n_envs=4, num_threads=num_threads, **kwargs)
     singles = DummyVecEnv([lambda: ContinualProcgen(n_envs=4, **kwargs) for _ in range(4)])
-    assert (ours.num_envs, ours.observation_space, ours.action_space) == (
+    assert (own.num_envs, own.observation_space, own.action_space) == (
         (singles.num_envs, singles.observation_space, singles.action_space)
     )
-    assert ours.seed(3) == singles.seed(3)
-    assert np.array_equal(ours.reset(), singles.reset())
+    assert own.seed(3) == singles.seed(3)
+    assert np.array_equal(own.reset(), singles.reset())
     ends = {"terminated": 0, "truncated": 0}
     for step, actions in enumerate(random_actions(200, size=(4,)), start=1):
-        observations, rewards, dones, infos = ours.step(actions)
+        observations, rewards, dones, infos = own.step(actions)
         expected = singles.step(actions)
         assert np.array_equal(observations, expected[0]) and observations.dtype == np.uint8
         assert np.array_equal(rewards, expected[1]) and rewards.dtype == np.float32
@@ -418,11 +418,11 @@ def test_vectorised_is_the_same_as_single_ones(num_threads):
             }
             ends["truncated"] += info["TimeLimit.truncated"]
         ends["terminated"] += sum(dones) - sum(info["TimeLimit.truncated"] for info in infos)
-        assert ours.reset_infos == [{"task_id": int(step >= 75) + int(step >= 84)}] * 4
+        assert own.reset_infos == [{"task_id": int(step >= 75) + int(step >= 84)}] * 4
         if step == 150:
-            assert np.array_equal(ours.reset(), singles.reset())  # in the middle
+            assert np.array_equal(own.reset(), singles.reset())  # in the middle
     assert ends["terminated"] > 4 and ends["truncated"] > 4
-    ours.close()
+    own.close()
 
 
 def test_vectorised_arrays_are_not_used_again():
@@ -573,9 +573,9 @@ def test_other_algorithms_and_wrappers():
 
 def test_in_a_process_of_its_own():
     kwargs = dict(game="starpilot", n_tasks=2, steps_per_task=20)
-    ours = ContinualProcgenVecEnv(n_envs=1, **kwargs)
-    theirs = SubprocVecEnv([lambda: ContinualProcgen(**kwargs)])
-    assert np.array_equal(ours.reset(), theirs.reset())
+    own = ContinualProcgenVecEnv(n_envs=1, **kwargs)
+    other = SubprocVecEnv([lambda: ContinualProcgen(**kwargs)])
+    assert np.array_equal(own.reset(), other.reset())
     for actions in random_actions(30, size=(1,)):
-        assert np.array_equal(ours.step(actions)[0], theirs.step(actions)[0])
-    theirs.close()
+        assert np.array_equal(own.step(actions)[0], other.step(actions)[0])
+    other.close()

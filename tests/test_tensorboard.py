@@ -100,10 +100,10 @@ def test_ppo_in_a_continual_environment(tmp_path):
     assert board.titles() == {"Returns": RETURNS, "C-CHAIN": PPO_CHURN}
     charts = [tags for charts in board.layout().values() for tags in charts.values()]
     assert all(charts)
-    # Every metric of ours is in one chart
+    # Every metric of own is in one chart
     shown = [tag for tags in charts for tag in tags]
-    ours = {tag for tag in board.scalars() if tag.startswith(("continual/", "churn/"))}
-    assert sorted(shown) == sorted(ours - {"continual/n_switches"} | {"rollout/ep_rew_mean"})
+    own = {tag for tag in board.scalars() if tag.startswith(("continual/", "churn/"))}
+    assert sorted(shown) == sorted(own - {"continual/n_switches"} | {"rollout/ep_rew_mean"})
     assert board.layout()["Returns"]["Average return of each task"] == {"continual/average_task_0", "continual/average_task_1"}
 
 

@@ -1,5 +1,6 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
+import warnings
 from typing import Any
 
 import torch as th
@@ -28,8 +29,8 @@ class ChurnAlgorithm(BaseAlgorithm):
         With 0 the algorithm is its base, to the bit.
     :param target_churn_ratio: β, the size of λ·L_churn relative to the base loss. ``"auto"`` is a default for the kind of
         the network's outputs.
-    :param churn_warmup: Calls of ``train()`` until λ adapts
-    :param churn_window: Calls of ``train()`` that the running means of both losses cover
+    :param churn_warmup: Iterations until λ adapts: calls of ``train()`` with PPO, gradient updates with DQN
+    :param churn_window: Iterations that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the code
         released with the paper. Off by default, because C-CHAIN does not need to be told of a switch.
@@ -59,6 +60,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         # Raise on bad values before an environment is made
         self._make_churn_coefficient(default_target_ratio=1.0)
         self._task_switch = TaskSwitch()
+        self._is_first_training = True
         super().__init__(*args, **kwargs)
 
     def _make_churn_coefficient(self, default_target_ratio: float) -> ChurnCoefficient:
@@ -83,10 +85,20 @@ class ChurnAlgorithm(BaseAlgorithm):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
+        self._is_first_training = True
         if not isinstance(callback, (BaseCallback, list)):
             callback = ConvertCallback(callback)  # a function, or None
         given = callback if isinstance(callback, list) else [callback]
         return super()._init_callback(with_continual_callbacks([*given, FiniteCheck()], self.env), progress_bar)
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        if self._is_first_training and self.lr_schedule(self._current_progress_remaining) == 0:
+            warnings.warn(
+                "The learning rate is 0 from the first update of this `learn()` on, so nothing is learned. SB3's schedules go "
+                "to their end within each `learn()`: train for more than one rollout in a call, or use a constant rate."
+            )
+        self._is_first_training = False
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)
