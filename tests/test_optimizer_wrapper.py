@@ -52,6 +52,7 @@ def make(name, network):
 
 
 def train(network, optimizer, steps):
+    th.manual_seed(0)  # for methods that draw random numbers
     for step in steps:
         loss = (network(DATA[step]) - DATA[step, :, :2] ** 2).square().mean()
         optimizer.zero_grad()
