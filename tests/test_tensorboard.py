@@ -133,6 +133,9 @@ def test_each_tag_of_a_method_has_one_chart():
     assert tags >= METHOD_TAGS
     for tag in tags - {"continual/n_switches"}:
         assert sum(map(len, layout_of({tag}).values())) == 1, f"{tag} has no chart, or several: see add_charts"
+    assert layout_of(tags)["Related methods"] == LAYOUT["Related methods"]
+    for tag in ("redo/dormant_share/q_net.q_net.0", "trac/scale_actor", "parseval/loss_critic"):
+        assert sum(map(len, layout_of({tag}).values())) == 1
 
 
 def test_charts_can_be_added(monkeypatch):
@@ -152,14 +155,12 @@ def test_each_tag_of_the_monitors_has_one_chart():
             for batch in ("fixed", "fresh")
             for name in ("policy_churn", "value_churn", "greedy_action_changes")
         ),
-        *("redo/dormant_share/q_net.q_net.0", "trac/scale_actor", "parseval/loss_critic"),
-        *METHOD_TAGS,
     }
     of_tags = [
         [title for charts in layout_of({tag}).values() for title in charts] for tag in sorted({*tags, "eval/mean_reward"})
     ]
     assert [len(titles) for titles in of_tags] == [1] * len(of_tags)
-    monitors = ("Churn, monitored", "Neural tangent kernel", "Network health", "Related methods")
+    monitors = ("Churn, monitored", "Neural tangent kernel", "Network health")
     assert layout_of(tags) == {category: LAYOUT[category] for category in monitors}
     # Whole tags
     assert layout_of({"churn/coefficient", "my_ntk/srank", "health/dormant_shares", "continual/average_task_x"}) == {}
