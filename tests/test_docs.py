@@ -17,6 +17,7 @@ import yaml
 from rl_zoo3.train import train
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_cchain.tensorboard import layout
 from sb3_cchain.zoo import cli
 
 ROOT = Path(__file__).parent.parent
@@ -80,7 +81,9 @@ def short_rollouts(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
-def test_python_runs(page, short_rollouts):
+def test_python_runs(page, short_rollouts, monkeypatch):
+    # The charts that a snippet adds are not for other tests
+    monkeypatch.setattr(layout, "LAYOUT", {category: dict(charts) for category, charts in layout.LAYOUT.items()})
     names: dict = {}
     exec(GIVEN.get(name_of(page), ""), names)
     for code in snippets(page, "python"):
