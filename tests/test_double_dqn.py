@@ -1,4 +1,4 @@
-"""CChainDQN runs wherever DQN does, and says what it does."""
+"""DoubleDQN and CChainDQN: what is special about them."""
 
 import copy
 import weakref
@@ -13,62 +13,28 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
-from torch import nn
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
 from sb3_cchain.algorithms import dqn_cchain
 from sb3_cchain.networks.extractors import MinAtarCNN
+from tests.churn_models import (
+    DICT,
+    FORMS,
+    NormalisedExtractor,
+    assert_churn_was_reduced,
+    churn_keys,
+    state_of,
+)
 from tests.envs import CountEnv, RandomEnv
 
-SETTINGS = dict(learning_starts=20, buffer_size=200, batch_size=8, train_freq=1, learning_rate=1e-3, seed=0, device="cpu")
-CHURN_KEYS = {"churn/loss", "churn/coef", "churn/relative_loss", "churn/value_churn", "churn/greedy_action_changes"}
-
-BOX = spaces.Box(-1, 1, (4,), np.float32)
-IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
-CELLS = spaces.Box(0, 1, (10, 10, 4), np.bool_)
+SETTINGS = FORMS["CChainDQN"].settings
+learn = FORMS["CChainDQN"].learn
 
 
-def learn(env=None, policy="MlpPolicy", n_timesteps=50, **kwargs):
-    # Without logs in between, so that the last updates' are there to look at
-    return CChainDQN(policy, env or RandomEnv(), **{**SETTINGS, **kwargs}).learn(n_timesteps, log_interval=10**6)
-
-
-def assert_churn_was_reduced(model):
-    logged = model.logger.name_to_value
-    assert CHURN_KEYS <= set(logged)
-    assert all(np.isfinite(logged[key]) for key in CHURN_KEYS)
-    assert logged["churn/value_churn"] > 0
-
-
-@pytest.mark.parametrize(
-    "policy, observation_space",
-    [
-        ("MlpPolicy", BOX),
-        ("MlpPolicy", spaces.Discrete(5)),
-        ("MlpPolicy", spaces.MultiBinary(4)),
-        ("CnnPolicy", IMAGE),
-        ("MultiInputPolicy", spaces.Dict({"vector": BOX, "image": IMAGE})),
-    ],
-    ids=["Box", "Discrete", "MultiBinary", "image", "Dict"],
-)
-def test_spaces(policy, observation_space):
-    assert_churn_was_reduced(learn(RandomEnv(observation_space), policy))
-
-
-@pytest.mark.parametrize("vec_env_cls", [None, SubprocVecEnv])
-def test_vectorised_and_normalised(vec_env_cls):
-    env = VecNormalize(make_vec_env(RandomEnv, n_envs=2, vec_env_cls=vec_env_cls))
-    references = []
-    model = CChainDQN("MlpPolicy", env, **SETTINGS)
-    remember = model.churn_reducer.remember
-    model.churn_reducer.remember = lambda reference, outputs: (references.append(reference), remember(reference, outputs))
-    model.learn(100, log_interval=10**6)
-    assert_churn_was_reduced(model)
-    # Reference batches are normalised as minibatches are: the buffer holds the environment's own observations, in [-1, 1]
-    assert th.cat(references).abs().max() > 1 >= np.abs(model.replay_buffer.observations).max()
-    env.close()
+def test_defaults():
+    model = CChainDQN("MlpPolicy", RandomEnv(), device="cpu")
+    assert model.double_q and model.loss == "huber"
 
 
 @pytest.mark.parametrize(
@@ -107,17 +73,6 @@ def test_hindsight_experience_replay():
     assert_churn_was_reduced(model)
 
 
-class NormalisedExtractor(BaseFeaturesExtractor):
-    """BatchNorm and dropout."""
-
-    def __init__(self, observation_space):
-        super().__init__(observation_space, 8)
-        self.net = nn.Sequential(nn.Linear(4, 8), nn.BatchNorm1d(8), nn.Dropout(0.5))
-
-    def forward(self, observations):
-        return self.net(observations)
-
-
 @pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
 def test_batch_norm_and_dropout_act_as_in_the_environment(cls):
     """Only the observations of a minibatch move the running statistics: not its next observations, nor reference batches."""
@@ -141,7 +96,7 @@ def test_batch_norm_and_dropout_act_as_in_the_environment(cls):
 def other_settings(name):
     return {
         "Box": dict(env=RandomEnv(), policy="MlpPolicy"),
-        "Dict": dict(env=RandomEnv(spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})), policy="MultiInputPolicy"),
+        "Dict": dict(env=RandomEnv(DICT), policy="MultiInputPolicy"),
         "VecNormalize": dict(env=VecNormalize(make_vec_env(RandomEnv, n_envs=2, seed=0)), policy="MlpPolicy", n_steps=3),
         "HER": dict(env=BitFlippingEnv(n_bits=4), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer),
     }[name]
@@ -157,7 +112,7 @@ def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, mo
     for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.allclose(p, q, rtol=0, atol=1e-5)
     together, alone = (model.logger.name_to_value for model in models)
-    assert all(together[key] == pytest.approx(alone[key], rel=1e-2) for key in CHURN_KEYS)
+    assert all(together[key] == pytest.approx(alone[key], rel=1e-2) for key in churn_keys(models[0]))
 
 
 class GenerousBuffer(ReplayBuffer):
@@ -190,15 +145,6 @@ def test_an_interrupted_update_leaves_nothing_behind():
     model.train(gradient_steps=3, batch_size=8)
     assert model.churn_reducer.coefficient.n_seen == n_seen + 3
     assert model.churn_reducer.losses == []
-
-
-def test_positional_arguments_are_those_of_dqn():
-    model = CChainDQN("MlpPolicy", RandomEnv(), 1e-3, 100, 7, 16, device="cpu")
-    assert (model.learning_rate, model.buffer_size, model.learning_starts, model.batch_size) == (1e-3, 100, 7, 16)
-    assert model.double_q and model.loss == "huber"
-    coefficient = model.churn_reducer.coefficient
-    assert (coefficient.target_ratio, coefficient.initial, coefficient.warmup) == (0.01, 1, 0)
-    assert len(coefficient.base_losses) == 1000
 
 
 @pytest.mark.parametrize("double_q", [False, True])
@@ -297,26 +243,6 @@ def test_defaults_hold_the_ratio_at_any_scale_of_the_rewards(scale):
     assert coefficient.value == pytest.approx(0.01 * base / (churn + 39e-8))
 
 
-def test_tensorboard_names(tmp_path):
-    for cls in (CChainDQN, DoubleDQN):
-        cls("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **SETTINGS).learn(25)
-    assert {folder.name for folder in tmp_path.iterdir()} == {"CChainDQN_1", "DoubleDQN_1"}
-
-
-def test_another_policy_put_in_place():
-    model, other = learn(), learn(seed=1)
-    model.policy = other.policy
-    model._create_aliases()
-    model.learn(50, log_interval=10**6)
-    assert_churn_was_reduced(model)
-
-
-def state_of(model):
-    """Parameters, and C-CHAIN's numbers."""
-    coefficient = model.churn_reducer.coefficient.state_dict() if isinstance(model, CChainDQN) else {}
-    return [tensor.clone() for tensor in (*model.policy.state_dict().values(), *coefficient.values())]
-
-
 @pytest.mark.parametrize(
     "make",
     [DoubleDQN, partial(CChainDQN, churn_warmup=3), partial(CChainDQN, churn_coef=0.0)],
@@ -351,15 +277,6 @@ def test_huge_rewards_are_no_error():
     assert all(tensor.isfinite().all() for tensor in state_of(model))
 
 
-def test_an_infinite_churn_loss_is_named_before_an_update():
-    model = learn()
-    model.churn_reducer.old_outputs.fill_(float("nan"))
-    before = state_of(model)
-    with pytest.raises(ValueError, match="The churn loss is nan"):
-        model.train(gradient_steps=1, batch_size=8)
-    assert all(th.equal(*pair) for pair in zip(before, state_of(model), strict=True))
-
-
 def test_continual_environment_brings_its_callbacks():
     env = ContinualEnv([CountEnv, CountEnv], 60)
     model = learn(env, n_timesteps=120, reset_churn_coef=True)
@@ -367,9 +284,6 @@ def test_continual_environment_brings_its_callbacks():
     assert [row["mean_return"] for row in model.continual_returns] == [7.0] * 8 + [4.0] + [7.0] * 8
     # λ started over at the switch: the updates of the second task
     assert model.churn_reducer.coefficient.n_seen == 60
-
-
-# --- Bad input ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
@@ -400,26 +314,9 @@ def test_bad_arguments(cls, arguments, error, message):
         cls("MlpPolicy", "no environment is made", **arguments)
 
 
-@pytest.mark.parametrize(
-    "arguments, name",
-    [
-        ({"churn_coef": -0.5}, "churn_coef"),
-        ({"target_churn_ratio": "big"}, "target_churn_ratio"),
-        ({"churn_window": 0}, "churn_window"),
-    ],
-)
-def test_bad_churn_arguments(arguments, name):
-    with pytest.raises(ValueError, match=f"`{name}`.*got {next(iter(arguments.values()))!r}"):
-        CChainDQN("MlpPolicy", "no environment is made", **arguments)
-
-
 def test_n_step_returns_of_dict_observations_are_refused():
-    env = RandomEnv(spaces.Dict({"a": BOX}))
     with pytest.raises(ValueError, match="`n_steps=1`, got 3"):
-        DoubleDQN("MultiInputPolicy", env, n_steps=3)
-
-
-# --- The feature extractor ------------------------------------------------------------------------------------------------
+        DoubleDQN("MultiInputPolicy", RandomEnv(DICT), n_steps=3)
 
 
 def test_observations_stay_small_in_the_replay_buffer():
@@ -429,8 +326,3 @@ def test_observations_stay_small_in_the_replay_buffer():
     arrays = [array for array in vars(buffer).values() if isinstance(array, np.ndarray)]
     bytes_per_transition = sum(array.nbytes for array in arrays) / buffer.buffer_size
     assert 2000 <= bytes_per_transition and 500_000 * bytes_per_transition <= 1.2e9
-
-
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
-def test_cuda():
-    assert_churn_was_reduced(learn(device="cuda"))

@@ -1,0 +1,156 @@
+"""CChainPPO: what is special about churn reduction of PPO's policy."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_cchain import CChainPPO
+from sb3_cchain.networks.policy_outputs import policy_outputs
+from tests.churn_models import ACTION_SPACES, FORMS, NormalisedExtractor, assert_churn_was_reduced, assert_equal, churn_keys
+from tests.envs import RandomEnv
+
+SETTINGS = FORMS["CChainPPO"].settings
+learn = FORMS["CChainPPO"].learn
+
+
+@pytest.mark.parametrize("squash", [False, True])
+def test_gsde(squash):
+    env = RandomEnv(action_space=ACTION_SPACES[-1])
+    model = learn(env, use_sde=True, sde_sample_freq=4, policy_kwargs=dict(squash_output=squash))
+    assert_churn_was_reduced(model)
+
+
+def test_batch_norm_and_dropout_act_in_the_churn_loss_as_they_do_in_the_environment():
+    model = learn(RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor))
+    assert_churn_was_reduced(model)
+    # Reference batches neither move the running statistics nor draw from the random numbers of dropout, so that a λ
+    # too small to matter leaves the parameters as PPO's
+    tiny = learn(RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor), churn_coef=1e-30)
+    plain = PPO("MlpPolicy", RandomEnv(), policy_kwargs=dict(features_extractor_class=NormalisedExtractor), **SETTINGS)
+    plain.learn(64)
+    assert_equal(plain, tiny)
+
+
+class CountingBuffer(RolloutBuffer):
+    n_gets = 0
+
+    def get(self, batch_size=None):
+        self.n_gets += 1
+        yield from super().get(batch_size)
+
+
+def test_other_arguments_of_ppo():
+    model = learn(
+        RandomEnv(),
+        rollout_buffer_class=CountingBuffer,
+        stats_window_size=3,
+        target_kl=1.0,
+        clip_range_vf=0.2,
+        normalize_advantage=False,
+        learning_rate=lambda progress: 1e-3 * (1 + progress),
+    )
+    assert_churn_was_reduced(model)
+    assert model.rollout_buffer.n_gets == 4
+    assert "get" not in vars(model.rollout_buffer) and "zero_grad" not in vars(model.policy.optimizer)
+    assert model.ep_info_buffer.maxlen == 3
+
+
+def test_early_stopping_before_the_first_update():
+    model = learn(RandomEnv(), target_kl=-1.0)
+    assert model.policy.optimizer.state_dict()["state"] == {}  # not one update
+    assert not churn_keys(model) & set(model.logger.name_to_value)
+    assert model.churn_reducer.coefficient.n_seen == 0
+
+
+@pytest.mark.parametrize("churn_base_loss, of_entropy", [("actor", 0.01), ("surrogate", 0.0)])
+def test_adaptive_coefficient_holds_the_ratio(churn_base_loss, of_entropy):
+    # A window of one iteration: λ of an iteration is set by the losses of the one before
+    arguments = dict(churn_warmup=1, churn_window=1, churn_base_loss=churn_base_loss)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", ent_coef=0.01, **arguments, **SETTINGS)
+    model.learn(5 * 32)
+    logged = model.logger.name_to_value
+    base_loss = abs(logged["train/policy_gradient_loss"] + of_entropy * logged["train/entropy_loss"])
+    assert logged["churn/relative_loss"] == pytest.approx(logged["churn/coef"] * logged["churn/loss"] / base_loss, rel=1e-4)
+    coefficient = model.churn_reducer.coefficient
+    assert coefficient.base_losses.item() == pytest.approx(base_loss)
+    assert coefficient.churn_losses.item() == pytest.approx(logged["churn/loss"])
+    assert coefficient.value == pytest.approx(1e4 * base_loss / logged["churn/loss"], rel=1e-4)
+
+
+def test_policy_churn_is_the_kl_divergence():
+    """One update per iteration, so that the logged mean is one number that can be computed from two saved policies."""
+    model = CChainPPO(
+        "MlpPolicy", RandomEnv(), n_steps=32, batch_size=16, n_epochs=1, learning_rate=1e-2, seed=0, device="cpu"
+    )
+    pairs = []
+
+    def backward(reference, add_gradient, backward=model.churn_reducer.backward):
+        reducer = model.churn_reducer
+        if reducer.reference is not None:
+            with th.no_grad():
+                new = model.policy.get_distribution(reducer.reference).distribution
+            old = th.distributions.Categorical(probs=reducer.old_outputs)
+            pairs.append(th.distributions.kl_divergence(old, new).mean().item())
+        backward(reference, add_gradient)
+
+    model.churn_reducer.backward = backward
+    model.learn(2 * 32)
+    assert model.logger.name_to_value["churn/policy_churn"] == pytest.approx(np.mean(pairs[-2:]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(env=RandomEnv(), n_steps=33, batch_size=8),  # the last minibatch has one sample
+        dict(env=RandomEnv(), n_steps=8, batch_size=1, n_epochs=1, normalize_advantage=False),
+        dict(env=RandomEnv(action_space=spaces.Discrete(1400))),
+        dict(env=RandomEnv(action_space=spaces.MultiDiscrete([700, 2]))),
+    ],
+    ids=["last of one", "one", "many actions", "many sub-actions"],
+)
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_unusual_sizes_stay_finite(arguments):
+    model = learn(**arguments)
+    assert all(np.isfinite(value) for key, value in model.logger.name_to_value.items() if key.startswith("churn/"))
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize("action_space", [ACTION_SPACES[0], ACTION_SPACES[-1]], ids=lambda space: type(space).__name__)
+def test_large_weights_stay_finite(action_space):
+    model = CChainPPO("MlpPolicy", RandomEnv(action_space=action_space), **SETTINGS)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.mul_(1e5)
+    model.learn(64)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    assert np.isfinite(model.churn_reducer.coefficient.value)
+
+
+@pytest.mark.parametrize("action_space", ACTION_SPACES, ids=lambda space: type(space).__name__)
+def test_outputs_are_those_of_the_distribution(action_space):
+    class SamePolicy(ActorCriticPolicy):
+        def get_distribution(self, obs):
+            return super().get_distribution(obs)
+
+    policies = [CChainPPO(cls, RandomEnv(action_space=action_space), **SETTINGS).policy for cls in ("MlpPolicy", SamePolicy)]
+    observations = th.randn(5, 4)
+    assert th.allclose(*(policy_outputs(policy, observations) for policy in policies))
+
+
+class TemperedPolicy(ActorCriticPolicy):
+    """Acts by other probabilities than those of its last layer."""
+
+    def _get_action_dist_from_latent(self, latent_pi):
+        return self.action_dist.proba_distribution(action_logits=50 * self.action_net(latent_pi))
+
+
+def test_a_policy_with_a_distribution_of_its_own():
+    model = learn(RandomEnv(), policy=TemperedPolicy)
+    assert_churn_was_reduced(model)
+    observations = th.randn(5, 4)
+    acting = model.policy.get_distribution(observations).distribution.probs
+    assert th.allclose(policy_outputs(model.policy, observations), acting)
