@@ -3,161 +3,242 @@
 import base64
 import copy
 import json
+import warnings
 import zipfile
 
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import DQN, PPO, HerReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.utils import set_random_seed
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
-from sb3_cchain.networks.policy_outputs import policy_outputs
+from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
+from tests.churn_models import (
+    ACTION_SPACES,
+    ALGORITHMS,
+    DICT,
+    DQN_SETTINGS,
+    FORMS,
+    PPO_SETTINGS,
+    Form,
+    assert_equal,
+    differ,
+    each_algorithm,
+    each_form,
+    go_on,
+)
 from tests.envs import RandomEnv
 
-SETTINGS = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu", churn_warmup=2, churn_window=4)
-DICT = spaces.Dict({"a": spaces.Box(-1, 1, (2,), np.float32), "b": spaces.Discrete(3)})
+ADAPTIVE = dict(churn_warmup=2, churn_window=4)
 
 
-def make_env(action_space=None, observation_space=None):
-    return RandomEnv(observation_space, action_space)
+def learn(form, **kwargs):
+    """λ has adapted at the end, and its window is full."""
+    return form.learn(n_timesteps=2 * form.n_timesteps, **{**ADAPTIVE, **kwargs})
 
 
-def one_more_iteration(model, callback=None):
-    """From the same random numbers and the same first observation."""
-    set_random_seed(7)
-    model.env.seed(7)
-    model._last_obs = None
-    model.learn(32, callback, reset_num_timesteps=False)
-    return model
+def save_and_load(model, folder, env=None, **kwargs):
+    """With its replay buffer, where it has one."""
+    model.save(folder / "model")
+    loaded = type(model).load(folder / "model", env=env or RandomEnv(), device="cpu", **kwargs)
+    if hasattr(model, "replay_buffer"):
+        model.save_replay_buffer(folder / "buffer")
+        loaded.load_replay_buffer(folder / "buffer")
+    return loaded
 
 
-def assert_equal(model, other):
-    for name, tensor in model.policy.state_dict().items():
-        assert th.equal(tensor, other.policy.state_dict()[name]), name
-    assert model.churn_reducer.coefficient.value == other.churn_reducer.coefficient.value
+DISCRETE, CONTINUOUS = ACTION_SPACES[0], ACTION_SPACES[-1]
 
 
-@pytest.mark.parametrize("policy, observation_space", [("MlpPolicy", None), ("MultiInputPolicy", DICT)])
-@pytest.mark.parametrize("action_space", [None, spaces.Box(-1, 1, (2,), np.float32)])
-def test_continues_as_if_never_stopped(tmp_path, policy, observation_space, action_space):
-    model = CChainPPO(policy, make_env(action_space, observation_space), **SETTINGS).learn(4 * 32)
-    model.save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", env=make_env(action_space, observation_space), device="cpu")
+@pytest.mark.parametrize(
+    "name, action_space, observation_space, arguments",
+    [
+        *((name, DISCRETE, observation_space, {}) for name in FORMS for observation_space in (None, DICT)),
+        *((name, CONTINUOUS, space, {}) for name in ("CChainPPO", "CChainCallback") for space in (None, DICT)),
+        ("CChainDQN", DISCRETE, None, dict(loss="mse", double_q=False, n_steps=3)),
+    ],
+)
+def test_continues_as_if_never_stopped(tmp_path, name, action_space, observation_space, arguments):
+    form, policy = FORMS[name], "MultiInputPolicy" if observation_space else "MlpPolicy"
+
+    def make_env():
+        return RandomEnv(observation_space, action_space)
+
+    model, *callbacks = form.make(make_env(), policy, **ADAPTIVE, **arguments)
+    callbacks += [form.make(**ADAPTIVE)[1] for _ in range(2)]
+    model.learn(2 * form.n_timesteps, callbacks[0])
+    loaded, forgetful = (save_and_load(model, tmp_path, make_env()) for _ in range(2))
+    assert {name: getattr(loaded, name) for name in arguments} == arguments
+    assert not differ(model, loaded)
+    # Without the reference batch the next update has no churn loss
+    if form.callback:
+        forgetful.churn_state["reducer"]["_extra_state"].update(reference=None, old_outputs=None)
+    else:
+        forgetful.churn_reducer.forget_reference()
+    for each, callback in zip((model, loaded, forgetful), callbacks, strict=True):
+        go_on(each, callback)
     assert_equal(model, loaded)
-    assert_equal(one_more_iteration(model), one_more_iteration(loaded))
-    assert model.num_timesteps == loaded.num_timesteps == 5 * 32
-    # λ had adapted, and the first update of the new iteration had a churn loss too
-    assert len(model.churn_reducer.coefficient.base_losses.nonzero()) == 4
-
-    # The history matters: a model that lost it goes on otherwise
-    forgetful = CChainPPO.load(tmp_path / "model", env=make_env(action_space, observation_space), device="cpu")
-    forgetful.churn_reducer.forget_reference()
-    one_more_iteration(forgetful)
-    assert any(not th.equal(p, q) for p, q in zip(forgetful.policy.parameters(), loaded.policy.parameters(), strict=True))
+    assert (model.num_timesteps, model._n_updates) == (loaded.num_timesteps, loaded._n_updates)
+    assert differ(forgetful, loaded)
+    # λ had adapted
+    coefficient = model.churn_state.reducer.coefficient
+    assert coefficient.value != 1 and coefficient.base_losses.all()
 
 
-def test_saved_before_training_and_predicts(tmp_path):
-    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)
+@each_algorithm
+@pytest.mark.parametrize("trained", [False, True])
+def test_predicts_without_an_environment(tmp_path, form, trained):
+    model = form.learn() if trained else form.make()[0]
     model.save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", device="cpu")
-    observation = np.zeros((1, 4), dtype=np.float32)
-    assert model.predict(observation, deterministic=True)[0] == loaded.predict(observation, deterministic=True)[0]
+    loaded = form.algorithm.load(tmp_path / "model", device="cpu")
+    observations = np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32)
+    assert np.array_equal(*(m.predict(observations, deterministic=True)[0] for m in (model, loaded)))
 
 
-def test_arguments_can_be_changed_on_loading(tmp_path):
-    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32).save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", target_churn_ratio=5.0)
+@each_algorithm
+def test_arguments_can_be_changed_on_loading(tmp_path, form):
+    loaded = save_and_load(learn(form), tmp_path, target_churn_ratio=5.0)
     assert loaded.churn_reducer.coefficient.target_ratio == 5.0
+    loaded.learn(form.n_timesteps)
 
 
-def test_a_fixed_coefficient_takes_over_from_an_adaptive_one(tmp_path):
-    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32).save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", churn_coef=0.0)
-    assert loaded.churn_reducer.coefficient.is_zero
-    loaded.learn(32)
+@each_algorithm
+@pytest.mark.parametrize(
+    "before, after, value", [("auto", 0.0, 0), ("auto", 0.5, 0.5), (0.0, "auto_3", 3), (0.5, "auto_3", 3)]
+)
+def test_another_kind_of_coefficient_starts_over(tmp_path, form, before, after, value):
+    loaded = save_and_load(learn(form, churn_coef=before), tmp_path, churn_coef=after)
+    coefficient = loaded.churn_reducer.coefficient
+    assert coefficient.value == value and coefficient.is_zero == (value == 0)
+    loaded.learn(form.n_timesteps)
 
 
-@pytest.mark.parametrize("coef", [0.0, 0.5])
-def test_an_adaptive_coefficient_takes_over_from_a_fixed_one(tmp_path, coef):
-    CChainPPO("MlpPolicy", make_env(), churn_coef=coef, **SETTINGS).learn(32).save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", churn_coef="auto_3")
-    assert loaded.churn_reducer.coefficient.value == 3
-    loaded.learn(32)
+@each_algorithm
+def test_another_window_starts_over(tmp_path, form):
+    model = learn(form)
+    loaded = save_and_load(model, tmp_path, churn_window=9)
+    assert loaded.churn_reducer.coefficient.value == 1 != model.churn_reducer.coefficient.value
+    loaded.learn(form.n_timesteps)
 
 
-def test_a_copy_of_the_model_has_a_network_of_its_own():
-    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)  # SB3's PPO cannot be copied once it was trained
+# SB3's PPO cannot be copied once it was trained
+@pytest.mark.parametrize("name, n_timesteps", [*((name, 0) for name in ALGORITHMS), ("CChainDQN", 50)])
+def test_a_copy_of_the_model_has_a_network_of_its_own(name, n_timesteps):
+    model, _ = ALGORITHMS[name].make()
+    if n_timesteps:
+        model.learn(n_timesteps)
+    observations, outputs = th.ones(2, 4), []
     copied = copy.deepcopy(model)
-    with th.no_grad():
-        for parameter in model.policy.parameters():
-            parameter.add_(1.0)
-    reducer, observations = copied.churn_reducer, th.ones(2, 4)
-    reducer.remember(observations)
-    assert th.equal(reducer.old_outputs, policy_outputs(copied.policy, observations).detach())
+    for reducer in (model.churn_reducer, copied.churn_reducer, model.churn_reducer):
+        reducer.remember(observations)
+        outputs.append(reducer.old_outputs)
+        if reducer is model.churn_reducer:
+            with th.no_grad():
+                for parameter in model.policy.parameters():
+                    parameter.add_(1.0)
+    before, of_copy, after = outputs
+    assert th.equal(before, of_copy) and not th.equal(before, after)
 
 
-def test_another_window_starts_over(tmp_path):
-    CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(4 * 32).save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", env=make_env(), device="cpu", churn_window=9)
-    assert loaded.churn_reducer.coefficient.value == 1.0
-    loaded.learn(32)
-
-
-def test_takes_a_checkpoint_of_ppo(tmp_path):
-    plain = PPO("MlpPolicy", make_env(), n_steps=32, batch_size=8, device="cpu").learn(32)
-    plain.save(tmp_path / "ppo")
-    model = CChainPPO.load(tmp_path / "ppo", env=make_env(), device="cpu")
-    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), plain.policy.parameters(), strict=True))
+@pytest.mark.parametrize("base, algorithm", [(PPO, CChainPPO), (DQN, DoubleDQN), (DQN, CChainDQN), (DoubleDQN, CChainDQN)])
+def test_takes_a_checkpoint_of_its_base(tmp_path, base, algorithm):
+    plain = base("MlpPolicy", RandomEnv(), **(PPO_SETTINGS if base is PPO else DQN_SETTINGS)).learn(40)
+    plain.save(tmp_path / "model")
+    model = algorithm.load(tmp_path / "model", env=RandomEnv(), device="cpu")
+    assert_equal(plain, model)
     model.learn(64)
-    assert model.churn_reducer.reference is not None
-    model.set_parameters(plain.get_parameters())
-    # The churn of the network that was replaced is forgotten
-    assert model.churn_reducer.reference is None and model.churn_reducer.coefficient.n_seen == 0
-    model.set_parameters(str(tmp_path / "ppo.zip"))
-    assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), plain.policy.parameters(), strict=True))
+    assert differ(plain, model)
+    if algorithm is not DoubleDQN:
+        assert model.churn_reducer.reference is not None
+        model.set_parameters(plain.get_parameters())
+        # The churn of the network that was replaced is forgotten
+        assert model.churn_reducer.reference is None and model.churn_reducer.coefficient.n_seen == 0
+    model.set_parameters(str(tmp_path / "model.zip"))
+    assert_equal(plain, model)
 
 
-def test_reference_goes_to_the_models_device(tmp_path):
+@each_algorithm
+@pytest.mark.parametrize("policy, observation_space", [("MlpPolicy", None), ("MultiInputPolicy", DICT)])
+def test_reference_goes_to_the_models_device(form, policy, observation_space):
     """As when a model was saved on a GPU; "meta" stands for the other device."""
-    model = CChainPPO("MultiInputPolicy", make_env(None, DICT), **SETTINGS).learn(32)
-    model.churn_reducer.move_reference("meta")
-    assert model.churn_reducer.old_outputs.is_meta and all(t.is_meta for t in model.churn_reducer.reference.values())
-    vector = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32)
-    vector.churn_reducer.move_reference("meta")
-    assert vector.churn_reducer.reference.is_meta
+    reducer = form.learn(RandomEnv(observation_space), policy).churn_reducer
+    reducer.move_reference("meta")
+    references = reducer.reference.values() if observation_space else [reducer.reference]
+    assert reducer.old_outputs.is_meta and all(tensor.is_meta for tensor in references)
 
 
-def test_its_policy_loads_without_the_package(tmp_path):
-    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(32)
+@each_algorithm
+def test_its_policy_loads_without_the_package(tmp_path, form):
+    model = form.learn()
     model.policy.save(tmp_path / "policy")
     policy = type(model.policy).load(tmp_path / "policy", device="cpu")
+    assert not type(policy).__module__.startswith("sb3_cchain")
     assert all(th.equal(p, q) for p, q in zip(model.policy.parameters(), policy.parameters(), strict=True))
+
+
+@each_algorithm
+def test_set_parameters_from_a_path_and_from_a_dict(form, tmp_path):
+    model = learn(form)
+    model.save(tmp_path / "model")
+    other, _ = form.make(**ADAPTIVE)
+    other.set_parameters(tmp_path / "model.zip", device="cpu")
+    assert other.churn_reducer.coefficient.n_seen == model.churn_reducer.coefficient.n_seen > 0
+    assert th.equal(other.churn_reducer.old_outputs, model.churn_reducer.old_outputs)
+    other.set_parameters(model.get_parameters())
+    # A dict has no history: these are the parameters of a network that has not churned yet
+    assert other.churn_reducer.reference is None and other.churn_reducer.coefficient.n_seen == 0
+    other.save(tmp_path / "other")
+    assert form.algorithm.load(tmp_path / "other", device="cpu").churn_reducer.coefficient.n_seen == 0
+
+
+@each_algorithm
+def test_the_task_is_kept(tmp_path, form):
+    """So that λ starts over at a switch that a resumed training begins with."""
+    model = form.learn(reset_churn_coef=True)
+    model._task_switch.task_id = 1
+    assert save_and_load(model, tmp_path)._task_switch.task_id == 1
+
+
+@pytest.mark.parametrize(
+    "form", [*FORMS.values(), Form(DoubleDQN, DQN, DQN_SETTINGS, 50, own_key="")], ids=[*FORMS, "DoubleDQN"]
+)
+@pytest.mark.parametrize("monitor", [False, True])
+def test_a_compiled_policy_trains_and_loads_as_one_that_is_not(tmp_path, form, monitor):
+    models, logged = [], []
+    for compiled in (False, True):
+        model, callback = form.make()
+        if compiled:
+            model.policy = th.compile(model.policy, backend="eager")
+        callbacks = [callback] * (callback is not None) + [ChurnMonitor(interval=3)] * monitor
+        models.append(model.learn(96, callback=callbacks))
+        logged.append(dict(model.logger.name_to_value))
+    plain, compiled = models
+    assert logged[0] == logged[1]
+    assert any(key.startswith("churn/") for key in logged[0]) == (form.algorithm is not DoubleDQN)
+    assert any(key.startswith("churn_monitor/") for key in logged[0]) == monitor
+    loaded = save_and_load(compiled, tmp_path)
+    for model in (compiled, loaded):
+        for p, q in zip(plain.policy.parameters(), model.policy.parameters(), strict=True):
+            assert th.equal(p, q)
+    for model in (plain, loaded):
+        go_on(model, form.make()[1])
+    assert_equal(plain, loaded)
 
 
 # --- What stock algorithms load, and the other way round -------------------------------------------------------------------
 
-DQN_SETTINGS = dict(learning_starts=20, buffer_size=200, batch_size=8, train_freq=1, seed=0, device="cpu")
-KINDS = {
-    "PPO": (PPO, lambda: CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(64)),
-    "DQN": (DQN, lambda: CChainDQN("MlpPolicy", make_env(), **DQN_SETTINGS).learn(64)),
-    "callback": (PPO, lambda: PPO("MlpPolicy", make_env(), **PLAIN).learn(64, CChainCallback(churn_warmup=1))),
-}
-PLAIN = {key: value for key, value in SETTINGS.items() if "churn" not in key}
 
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_stock_algorithms_load_it(kind, tmp_path):
-    stock, make = KINDS[kind]
-    model = make()
+@each_form
+def test_stock_algorithms_load_it(form, tmp_path):
+    model = learn(form)
     model.save(tmp_path / "model")
-    loaded = stock.load(tmp_path / "model", env=make_env(), device="cpu")
-    for name, tensor in model.policy.state_dict().items():
-        assert th.equal(tensor, loaded.policy.state_dict()[name]), name
+    loaded = form.stock.load(tmp_path / "model", env=RandomEnv(), device="cpu")
+    assert not differ(model, loaded)
     loaded.learn(64)
-    stock("MlpPolicy", make_env(), device="cpu").set_parameters(tmp_path / "model")
+    form.stock("MlpPolicy", RandomEnv(), **form.settings).set_parameters(tmp_path / "model")
     # Nothing of it needs this package
     with zipfile.ZipFile(tmp_path / "model.zip") as archive:
         data = json.loads(archive.read("data"))
@@ -166,37 +247,31 @@ def test_stock_algorithms_load_it(kind, tmp_path):
     assert not any(b"sb3_cchain" in pickled for pickled in pickles)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_saved_again_by_a_stock_algorithm_the_history_is_kept(kind, tmp_path):
-    stock, make = KINDS[kind]
-    model = make()
+@each_form
+def test_saved_again_by_a_stock_algorithm_the_history_is_kept(form, tmp_path):
+    model = learn(form)
     model.save(tmp_path / "model")
-    loaded = stock.load(tmp_path / "model", env=make_env(), device="cpu")
+    loaded = form.stock.load(tmp_path / "model", env=RandomEnv(), device="cpu")
     loaded.save(tmp_path / "unchanged")
     loaded.learn(64, reset_num_timesteps=False).save(tmp_path / "trained")
     for name, has_reference in (("unchanged", True), ("trained", False)):
-        if kind == "callback":
-            again = PPO.load(tmp_path / name, env=make_env(), device="cpu")
-            callback = CChainCallback(churn_warmup=1)
+        again = form.algorithm.load(tmp_path / name, env=RandomEnv(), device="cpu")
+        if form.callback:
             again.set_logger(configure(None, []))
-            callback.init_callback(again)
-            reducer = callback.churn_reducer
-        else:
-            again = type(model).load(tmp_path / name, env=make_env(), device="cpu")
-            reducer = again.churn_reducer
-        assert reducer.coefficient.value == model.churn_state.reducer.coefficient.value
+            form.callback(**ADAPTIVE).init_callback(again)
+        reducer = again.churn_state.reducer
+        assert reducer.coefficient.value == model.churn_state.reducer.coefficient.value != 1
         # What changed on the reference batch in training without churn reduction is no churn
         assert (reducer.reference is not None) == has_reference
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_parameters_are_tensors_by_the_names_of_the_stock_algorithm(kind):
-    stock, make = KINDS[kind]
-    model = make()
+@each_form
+def test_parameters_are_tensors_by_the_names_of_the_stock_algorithm(form):
+    model = form.learn()
     parameters = model.get_parameters()
     assert set(parameters) == {"policy", "policy.optimizer"}
     assert all(th.is_tensor(tensor) for tensor in parameters["policy"].values())
-    stock("MlpPolicy", make_env(), device="cpu").set_parameters(parameters)
+    form.stock("MlpPolicy", RandomEnv(), **form.settings).set_parameters(parameters)
     for missing in parameters:
         some = {name: state for name, state in parameters.items() if name != missing}
         with pytest.raises(ValueError, match="Names of parameters do not match"):
@@ -204,42 +279,120 @@ def test_parameters_are_tensors_by_the_names_of_the_stock_algorithm(kind):
         model.set_parameters(some, exact_match=False)
 
 
-def test_callback_goes_on_after_loading_as_if_never_stopped(tmp_path):
-    arguments = dict(churn_warmup=2, churn_window=4)
-    model = PPO("MlpPolicy", make_env(), **PLAIN).learn(4 * 32, CChainCallback(**arguments))
+# --- Double DQN ------------------------------------------------------------------------------------------------------------
+
+each_dqn = pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+
+
+def test_arguments_of_double_dqn_can_be_changed_on_loading(tmp_path):
+    loaded = save_and_load(FORMS["CChainDQN"].learn(), tmp_path, loss="mse", double_q=False)
+    assert (loaded.loss, loaded.double_q) == ("mse", False)
+    loaded.learn(50)
+
+
+@pytest.mark.parametrize("argument, error", [({"loss": "mae"}, ValueError), ({"double_q": "yes"}, TypeError)])
+def test_bad_arguments_on_loading(tmp_path, argument, error):
+    DoubleDQN("MlpPolicy", RandomEnv(), device="cpu").save(tmp_path / "model")
+    ((name, value),) = argument.items()
+    with pytest.raises(error, match=f"`{name}` must be .* got {value!r}"):
+        DoubleDQN.load(tmp_path / "model", env=RandomEnv(), device="cpu", **argument)
+
+
+@each_dqn
+def test_learning_rate_can_be_changed_on_loading(tmp_path, cls):
+    cls("MlpPolicy", RandomEnv(), **DQN_SETTINGS).learn(40).save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", env=RandomEnv(), device="cpu", learning_rate=0.5)
+    loaded.learn(40)
+    assert loaded.policy.optimizer.param_groups[0]["lr"] == 0.5
+
+
+@each_dqn
+def test_n_steps_can_be_changed_on_loading(tmp_path, cls):
+    cls("MlpPolicy", RandomEnv(), **DQN_SETTINGS).learn(40).save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", env=RandomEnv(), device="cpu", n_steps=3, replay_buffer_class=None)
+    assert isinstance(loaded.replay_buffer, NStepReplayBuffer) and loaded.replay_buffer.n_steps == 3
+    loaded.learn(40)
+    assert loaded._n_updates == 40
+
+
+class Watch(BaseCallback):
+    """Lists the environment steps at which the target network is copied, and the exploration rate of each step."""
+
+    def __init__(self):
+        super().__init__()
+        self.copies, self.rates = [], []
+
+    def _on_step(self):
+        # The model copies at the end of the step, after its callbacks
+        if (self.model._n_calls + 1) % self.model.target_update_interval == 0:
+            self.copies.append(self.num_timesteps)
+        self.rates.append(self.model.exploration_rate)
+        return True
+
+
+@each_dqn
+def test_exploration_and_target_updates_go_on_over_several_loads(tmp_path, cls):
+    settings = {**DQN_SETTINGS, "target_update_interval": 30, "exploration_fraction": 0.5}
+    watch = Watch()
+    model = cls("MlpPolicy", RandomEnv(), **settings).learn(40, callback=watch)
+    assert watch.rates[1] > 0.9
+    for _ in range(4):
+        model = save_and_load(model, tmp_path)
+        model.learn(40, reset_num_timesteps=False, callback=watch)
+    assert watch.copies == [30, 60, 90, 120, 150, 180]
+    # In all later parts more than half of all the steps have been made
+    assert watch.rates[40:] == [pytest.approx(0.05)] * 160
+
+
+@each_dqn
+@pytest.mark.parametrize(
+    "make_env, policy, arguments",
+    [
+        (RandomEnv, "MlpPolicy", dict(train_freq=(1, "episode"), gradient_steps=2)),
+        (
+            RandomEnv,
+            "MlpPolicy",
+            dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+        ),
+        (lambda: BitFlippingEnv(n_bits=4), "MultiInputPolicy", dict(replay_buffer_class=HerReplayBuffer)),
+    ],
+    ids=["episodes", "memory", "HER"],
+)
+def test_other_arguments_of_dqn_go_on_after_loading(tmp_path, cls, make_env, policy, arguments):
+    model = cls(policy, make_env(), **{**DQN_SETTINGS, **arguments}).learn(60)
+    loaded = save_and_load(model, tmp_path, make_env())
+    n_updates = loaded._n_updates
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded.learn(40, reset_num_timesteps=False)
+    assert loaded._n_updates > n_updates == model._n_updates > 0
+
+
+@each_dqn
+def test_a_lost_replay_buffer_is_warned_of(tmp_path, cls):
+    model = cls("MlpPolicy", RandomEnv(), **DQN_SETTINGS).learn(50)
     model.save(tmp_path / "model")
-    loaded = PPO.load(tmp_path / "model", env=make_env(), device="cpu")
-    without = PPO.load(tmp_path / "model", env=make_env(), device="cpu")
-    values = []
-    for goes_on, callback in ((model, CChainCallback(**arguments)), (loaded, CChainCallback(**arguments)), (without, None)):
-        one_more_iteration(goes_on, callback)
-        values.append(goes_on.logger.name_to_value.get("churn/coef"))
-    assert values[0] == values[1] not in (None, 1.0)
-    for name, tensor in model.policy.state_dict().items():
-        assert th.equal(tensor, loaded.policy.state_dict()[name]), name
-    assert not th.equal(model.policy.action_net.weight, without.policy.action_net.weight)
+    model.save_replay_buffer(tmp_path / "buffer")
+
+    def warned(reset_num_timesteps=False, load_buffer=False, times=1, **changed):
+        loaded = cls.load(tmp_path / "model", env=RandomEnv(), device="cpu", **changed)
+        if load_buffer:
+            loaded.load_replay_buffer(tmp_path / "buffer")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(times):
+                loaded.learn(10, reset_num_timesteps=reset_num_timesteps)
+        return [str(warning.message) for warning in caught]
+
+    (message,) = warned(times=2)
+    assert "at step 50, after `learning_starts=20`, with 0 transitions in the replay buffer" in message
+    assert warned(load_buffer=True) == []
+    assert warned(reset_num_timesteps=True) == []  # random steps first, as at the beginning
+    assert warned(learning_starts=100) == []
 
 
-@pytest.mark.parametrize("kind", ["PPO", "DQN"])
-def test_set_parameters_from_a_path_and_from_a_dict(kind, tmp_path):
-    model = KINDS[kind][1]()
-    model.save(tmp_path / "model")
-    other = type(model)("MlpPolicy", make_env(), device="cpu", **{k: v for k, v in SETTINGS.items() if "churn" in k})
-    other.churn_window = model.churn_window
-    other.set_parameters(tmp_path / "model.zip", device="cpu")
-    assert other.churn_reducer.coefficient.n_seen == model.churn_reducer.coefficient.n_seen > 0
-    assert th.equal(other.churn_reducer.old_outputs, model.churn_reducer.old_outputs)
-    other.set_parameters(model.get_parameters())
-    # A dict has no history: these are the parameters of a network that has not churned yet
-    assert other.churn_reducer.reference is None and other.churn_reducer.coefficient.n_seen == 0
-    other.save(tmp_path / "other")
-    assert type(model).load(tmp_path / "other", device="cpu").churn_reducer.coefficient.n_seen == 0
-
-
-def test_the_task_is_kept(tmp_path):
-    """So that λ starts over at a switch that a resumed training begins with."""
-    model = CChainPPO("MlpPolicy", make_env(), reset_churn_coef=True, **SETTINGS).learn(32)
-    model._task_switch.task_id = 1
-    model.save(tmp_path / "model")
-    loaded = CChainPPO.load(tmp_path / "model", device="cpu")
-    assert loaded._task_switch.task_id == 1
+def test_a_short_training_that_goes_on_has_lost_nothing(recwarn):
+    model = CChainDQN("MlpPolicy", RandomEnv(), **{**DQN_SETTINGS, "learning_starts": 0, "batch_size": 32})
+    for _ in range(3):
+        model.learn(5, reset_num_timesteps=False)
+    assert len(recwarn) == 0
