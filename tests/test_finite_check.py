@@ -2,23 +2,13 @@
 
 import numpy as np
 import pytest
-import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
+from tests.churn_models import BOX, IMAGE, each_form
 from tests.envs import RandomEnv
 
-BOX = spaces.Box(-1, 1, (4,), np.float32)
-DICT = spaces.Dict({"image": spaces.Box(0, 255, (36, 36, 3), np.uint8), "a": spaces.Box(-1, 1, (2,), np.float64)})
-PPO_SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
-DQN_SETTINGS = dict(learning_starts=5, buffer_size=50, batch_size=8, train_freq=1, seed=0, device="cpu")
-LEARNERS = {
-    "CChainPPO": lambda *args: (CChainPPO(*args, **PPO_SETTINGS), None),
-    "CChainDQN": lambda *args: (CChainDQN(*args, **DQN_SETTINGS), None),
-    "CChainCallback": lambda *args: (PPO(*args, **PPO_SETTINGS), CChainCallback()),
-}
+DICT = spaces.Dict({"image": IMAGE, "a": spaces.Box(-1, 1, (2,), np.float64)})
 
 
 class FaultyEnv(RandomEnv):
@@ -50,62 +40,61 @@ def vectorise(*envs):
     return DummyVecEnv([lambda env=env: env for env in envs])
 
 
-def learn(learner, env, policy="MlpPolicy"):
-    model, callback = LEARNERS[learner](policy, env)
+def learn(form, env, policy="MlpPolicy"):
+    model, callback = form.make(env, policy)
     updates = []
     model.policy.optimizer.register_step_pre_hook(lambda *_: updates.append(model.num_timesteps))
     try:
         return model.learn(64, callback)
+    except ValueError:
+        assert max(updates, default=-1) < model.num_timesteps  # none after the bad value
+        raise
     finally:
         assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
-        # No update after the bad value
-        assert not updates or model.num_timesteps >= max(updates)
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@each_form
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("fault", ["reward", "observation"])
-def test_names_environment_step_and_what(learner, fault, value):
+def test_names_environment_step_and_what(form, fault, value):
     env = vectorise(FaultyEnv(), FaultyEnv(fault, 13, value))
     with pytest.raises(ValueError, match=f"Environment 1 gave a NaN or infinite {fault} at step 26 .* it holds {value}"):
-        learn(learner, env)
+        learn(form, env)
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@each_form
 @pytest.mark.parametrize(
     "at, step",
     [(0, 0), (10, 10)],  # of the first reset; of an episode's last step, which the environment resets after
 )
-def test_observations_around_a_reset(learner, at, step):
+def test_observations_around_a_reset(form, at, step):
     with pytest.raises(ValueError, match=f"Environment 0 gave a NaN or infinite observation at step {step} "):
-        learn(learner, vectorise(FaultyEnv("observation", at)))
+        learn(form, vectorise(FaultyEnv("observation", at)))
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_observations_of_a_dict(learner):
+@each_form
+def test_observations_of_a_dict(form):
     with pytest.raises(ValueError, match="observation 'a' at step 7 "):
-        learn(learner, vectorise(FaultyEnv("observation", 7, observation_space=DICT)), "MultiInputPolicy")
+        learn(form, vectorise(FaultyEnv("observation", 7, observation_space=DICT)), "MultiInputPolicy")
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@each_form
 @pytest.mark.parametrize("fault", ["reward", "observation"])
-def test_normalised(learner, fault):
+def test_normalised(form, fault):
     """VecNormalize clips an infinite value, but its statistics show it at the same step."""
     with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=f"infinite {fault} at step 7 "):
-        learn(learner, VecNormalize(vectorise(FaultyEnv(fault, 7, np.inf))))
+        learn(form, VecNormalize(vectorise(FaultyEnv(fault, 7, np.inf))))
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_names_the_id(learner):
+@each_form
+def test_names_the_id(form):
     env = vectorise(FaultyEnv("reward", 3))
     env.envs[0].spec = type("Spec", (), {"id": "Faulty-v0"})
     with pytest.raises(ValueError, match=r"Environment 0 \(Faulty-v0\) gave"):
-        learn(learner, env)
+        learn(form, env)
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@each_form
 @pytest.mark.parametrize("reward", [1e12, -1e12])
-def test_large_values_are_allowed(learner, reward):
-    model = learn(learner, vectorise(FaultyEnv("reward", 7, reward)))
-    assert model.num_timesteps == 64
-    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+def test_large_values_are_allowed(form, reward):
+    assert learn(form, vectorise(FaultyEnv("reward", 7, reward))).num_timesteps == 64
