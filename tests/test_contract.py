@@ -1,19 +1,31 @@
 """
-Churn reduction through the optimiser seam equals churn reduction written into the training loop. An SB3 release that moves
-the seam turns these tests red, not the results wrong.
+Training equals SB3's own ``train()`` with the churn term, Double Q-learning and the loss written into its source, and a loop
+that copies the network at every update. An SB3 release that changes its ``train()`` makes these tests fail.
 """
 
-import gymnasium as gym
-import numpy as np
+from functools import cache, partial
+
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
+from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
-from sb3_cchain import CChainPPO
+from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.algorithms import dqn_cchain
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import policy_outputs
+from tests.churn_models import assert_equal, differ
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
+
+
+def assert_close(model, other, atol):
+    for name, tensor in model.policy.state_dict().items():
+        assert th.allclose(tensor, other.policy.state_dict()[name], rtol=0, atol=atol), name
+
+
+# --- PPO -------------------------------------------------------------------------------------------------------------------
 
 N_ITERATIONS = 8
 
@@ -53,7 +65,7 @@ class WrittenOutPPO(PPO):
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.parametrize("max_grad_norm", [0.5, 0.05])
 @pytest.mark.parametrize("target_kl", [None, 0.0005])
-def test_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl):
+def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl):
     settings = dict(PPO_SETTINGS, max_grad_norm=max_grad_norm, target_kl=target_kl)
     written_out = WrittenOutPPO("MlpPolicy", env_id, **settings).learn(64 * N_ITERATIONS)
     seam = CChainPPO("MlpPolicy", env_id, churn_coef=COEF, **settings).learn(64 * N_ITERATIONS)
@@ -62,80 +74,136 @@ def test_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, targ
     assert written_out.n_optimizer_steps >= 100, written_out.n_optimizer_steps
     stopped_early = written_out.n_optimizer_steps < 16 * N_ITERATIONS
     assert stopped_early == (target_kl is not None)
-    for name, parameter in seam.policy.named_parameters():
-        assert th.equal(parameter, written_out.policy.get_parameter(name)), name
-    # The term makes a difference
-    assert any(not th.equal(p, q) for p, q in zip(seam.policy.parameters(), plain.policy.parameters(), strict=True))
+    assert_equal(seam, written_out)
+    assert differ(seam, plain)  # the term makes a difference
 
 
 @pytest.mark.parametrize("env_id, target_churn_ratio", [("CartPole-v1", 1e4), ("Pendulum-v1", 0.05)])
-def test_equals_a_loop_that_copies_the_network(env_id, target_churn_ratio):
+def test_ppo_equals_a_loop_that_copies_the_network(env_id, target_churn_ratio):
     arguments = dict(target_churn_ratio=target_churn_ratio, churn_warmup=2, churn_window=5, **PPO_SETTINGS)
     copying = DeepCopyPPO("MlpPolicy", env_id, **arguments).learn(64 * 13)
     seam = CChainPPO("MlpPolicy", env_id, **arguments).learn(64 * 13)
     assert seam.policy.optimizer.state_dict()["state"][0]["step"] == 13 * 16 >= 200
-    for name, parameter in seam.policy.named_parameters():
-        assert th.allclose(parameter, copying.policy.get_parameter(name), rtol=0, atol=1e-6), name
+    assert_close(seam, copying, atol=1e-6)
     # λ had adapted
     assert seam.logger.name_to_value["churn/coef"] not in (0.0, 1.0)
 
 
-class IndexEnv(gym.Env):
-    """The observation is the number of steps made, so that a sample can be told from the others."""
+# --- DQN -------------------------------------------------------------------------------------------------------------------
 
-    observation_space = gym.spaces.Box(0, np.inf, (1,))
-    action_space = gym.spaces.Discrete(2)
+DQN_SETTINGS = dict(
+    learning_rate=3e-3,
+    learning_starts=50,
+    buffer_size=300,
+    batch_size=16,
+    train_freq=2,
+    gradient_steps=2,
+    target_update_interval=100,
+    policy_kwargs=dict(net_arch=[16]),
+    seed=0,
+    device="cpu",
+)
+N_STEPS = 270  # 220 updates
 
-    def __init__(self):
-        self.n = 0
-
-    def reset(self, *, seed=None, options=None):
-        return np.array([self.n], dtype=np.float32), {}
-
-    def step(self, action):
-        self.n += 1
-        return np.array([self.n], dtype=np.float32), 0.0, False, False, {}
-
-
-class RecordingPPO(CChainPPO):
-    """Records which samples each update was made on, and on which its churn was measured."""
-
-    def _setup_model(self):
-        super()._setup_model()
-        self.trained_on, self.measured_on = [], []
-        evaluate_actions, backward = self.policy.evaluate_actions, self.churn_reducer.backward
-
-        def recording_evaluate_actions(observations, actions):
-            self.trained_on.append({int(x) for x in observations})
-            return evaluate_actions(observations, actions)
-
-        def recording_backward(reference, *args):
-            self.measured_on.append({int(x) for x in reference})
-            return backward(reference, *args)
-
-        self.policy.evaluate_actions = recording_evaluate_actions
-        self.churn_reducer.backward = recording_backward
+DOUBLE_Q = (
+    "next_q_values, _ = next_q_values.max(dim=1)",
+    "greedy = self.q_net(replay_data.next_observations).argmax(dim=1, keepdim=True)\n"
+    "next_q_values = next_q_values.gather(1, greedy)",
+)
+MSE = ("F.smooth_l1_loss(", "F.mse_loss(")
+CHURN = [
+    ("losses.append(loss.item())", "losses.append(loss.item())\nloss = loss + self.churn_term()"),
+    ("self.policy.optimizer.zero_grad()", "self.remember(batch_size)\nself.policy.optimizer.zero_grad()"),
+]
 
 
-@pytest.mark.parametrize("n_steps, batch_size", [(64, 16), (64, 32), (60, 20), (70, 32), (64, 8)])
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
-def test_reference_batch_shares_nothing_with_the_minibatch(n_steps, batch_size):
-    model = RecordingPPO("MlpPolicy", IndexEnv(), n_steps=n_steps, batch_size=batch_size, n_epochs=3, seed=0, device="cpu")
-    model.learn(2 * n_steps)
-    n_minibatches = -(-n_steps // batch_size)
-    assert len(model.trained_on) == len(model.measured_on) == 2 * 3 * n_minibatches
-    for trained_on, measured_on in zip(model.trained_on, model.measured_on, strict=True):
-        assert not trained_on & measured_on
-    # Over an epoch, each sample serves once
-    for epoch in range(6):
-        of_epoch = model.measured_on[epoch * n_minibatches : (epoch + 1) * n_minibatches]
-        assert len(set.union(*of_epoch)) == sum(map(len, of_epoch)) == n_steps
+def rewritten_dqn(*replacements):
+    """SB3's DQN with its source changed."""
+
+    class WrittenOutDQN(DQN):
+        train = rewritten(DQN.train, *replacements)
+        pending = None
+        n_churn_terms = 0
+
+        def churn_term(self):
+            if self.pending is None:
+                return 0.0
+            self.n_churn_terms += 1
+            reference, old = self.pending
+            return COEF * th.nn.functional.mse_loss(self.q_net(reference), old)
+
+        def remember(self, batch_size):
+            reference = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env).observations
+            with th.no_grad():
+                self.pending = reference, self.q_net(reference)
+
+    return WrittenOutDQN
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("verbose, n_lines", [(0, 0), (1, 1)])
-def test_rollout_of_one_minibatch_is_its_own_reference(verbose, n_lines, capsys):
-    model = CChainPPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, n_epochs=2, verbose=verbose, device="cpu")
-    model.learn(3 * 32)
-    assert capsys.readouterr().out.count("32 steps is a single minibatch of batch_size=32") == n_lines
-    assert len(model.churn_reducer.coefficient.churn_losses.nonzero()) == 3
+@cache
+def without_churn_reduction(algorithm, **arguments):
+    return algorithm("MlpPolicy", "CartPole-v1", **DQN_SETTINGS, **arguments).learn(N_STEPS)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("double_q, loss", [(True, "mse"), (True, "huber"), (False, "mse")])
+def test_double_dqn_equals_sb3_source_with_other_targets_and_loss(double_q, loss, n_steps):
+    arguments = dict(DQN_SETTINGS, n_steps=n_steps)
+    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"))
+    written_out = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
+    model = DoubleDQN("MlpPolicy", "CartPole-v1", double_q=double_q, loss=loss, **arguments).learn(N_STEPS)
+    assert model._n_updates == 220
+    assert_equal(model, written_out)
+    assert model.logger.name_to_value["train/loss"] == written_out.logger.name_to_value["train/loss"]
+    assert differ(model, without_churn_reduction(DQN, n_steps=n_steps))
+
+
+class DoublePrecision(FlattenExtractor):
+    """The churn loss is a difference of nearly equal numbers: in single precision its rounding errors soon show."""
+
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+def learn_in_double_precision(make, n_steps, env_id="CartPole-v1", **arguments):
+    arguments["policy_kwargs"] = dict(net_arch=[16], features_extractor_class=DoublePrecision)
+    model = make("MlpPolicy", env_id, **arguments)
+    model.policy.double()
+    return model.learn(n_steps)
+
+
+@pytest.mark.parametrize("own_pass", [False, True])
+@pytest.mark.parametrize("max_grad_norm", [10, 0.05])
+@pytest.mark.parametrize("double_q, loss", [(True, "mse"), (False, "huber")])
+def test_dqn_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max_grad_norm, own_pass, monkeypatch):
+    arguments = dict(DQN_SETTINGS, max_grad_norm=max_grad_norm)
+    cchain = partial(CChainDQN, double_q=double_q, loss=loss, churn_coef=COEF)
+    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN)
+    if own_pass:
+        monkeypatch.setattr(dqn_cchain, "has_training_mode", lambda policy: True)
+        reference = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
+        model = cchain("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)
+        assert_equal(model, reference)
+    else:
+        # Batches of twice the size are summed in another order
+        reference = learn_in_double_precision(written_out, N_STEPS, **arguments)
+        model = learn_in_double_precision(cchain, N_STEPS, **arguments)
+        assert_close(model, reference, atol=1e-9)
+    assert reference.n_churn_terms == 219  # the first update has no previous one
+    vanilla = without_churn_reduction(DoubleDQN, double_q=double_q, loss=loss, max_grad_norm=max_grad_norm)
+    assert not all(
+        th.allclose(p.float(), q, atol=1e-3)
+        for p, q in zip(model.policy.parameters(), vanilla.policy.parameters(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Acrobot-v1"])
+def test_dqn_equals_a_loop_that_copies_the_network(env_id):
+    arguments = dict(DQN_SETTINGS, target_churn_ratio=0.01, churn_warmup=20, churn_window=50, gradient_steps=1)
+    copying = learn_in_double_precision(DeepCopyDQN, 500, env_id, **arguments)
+    model = learn_in_double_precision(partial(CChainDQN, loss="mse", churn_coef="auto_50"), 500, env_id, **arguments)
+    assert model._n_updates == copying._n_updates == 225
+    assert_close(model, copying, atol=1e-9)
+    # λ had adapted
+    assert model.churn_reducer.coefficient.value == pytest.approx(copying._churn_coef())
+    assert model.churn_reducer.coefficient.value != 50

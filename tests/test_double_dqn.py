@@ -326,3 +326,35 @@ def test_observations_stay_small_in_the_replay_buffer():
     arrays = [array for array in vars(buffer).values() if isinstance(array, np.ndarray)]
     bytes_per_transition = sum(array.nbytes for array in arrays) / buffer.buffer_size
     assert 2000 <= bytes_per_transition and 500_000 * bytes_per_transition <= 1.2e9
+
+
+class FixedQ(th.nn.Module):
+    """A Q-network of two actions, whatever the observation."""
+
+    def __init__(self, *values):
+        super().__init__()
+        self.values = th.nn.Parameter(th.tensor([values]))
+
+    def forward(self, observations):
+        return self.values.repeat(len(observations), 1)
+
+
+@pytest.mark.parametrize(
+    "double_q, loss, expected",
+    [
+        # r = 0 and γ = 0.5. The online network prefers action 1, which the target network values at 4, and its best at 6.
+        (True, "mse", (1 - 0.5 * 4) ** 2),
+        (False, "mse", (1 - 0.5 * 6) ** 2),
+        (True, "huber", 0.5 * (1 - 0.5 * 4) ** 2),
+        (False, "huber", abs(1 - 0.5 * 6) - 0.5),
+    ],
+)
+def test_loss_by_hand(double_q, loss, expected):
+    model = DoubleDQN("MlpPolicy", RandomEnv(), double_q=double_q, loss=loss, gamma=0.5, **SETTINGS)
+    model.learn(20)  # not more than `learning_starts`
+    buffer = model.replay_buffer
+    buffer.rewards[:], buffer.actions[:], buffer.dones[:] = 0.0, 0, 0.0
+    model.q_net, model.q_net_target = FixedQ(1.0, 2.0), FixedQ(6.0, 4.0)
+    model.policy.optimizer = th.optim.SGD(model.q_net.parameters(), lr=0.1)
+    model.train(gradient_steps=1, batch_size=8)
+    assert model.logger.name_to_value["train/loss"] == pytest.approx(expected)
