@@ -10,7 +10,7 @@ NUMBERED_MINIBATCHES = (
     "minibatches = list(self.rollout_buffer.get(self.batch_size))\nfor position, rollout_data in enumerate(minibatches):",
 )
 
-# Under which PPO's loop and ours are compared, and the coefficient of the churn loss
+# For the comparisons with PPO's rewritten loop, and the coefficient of the churn loss
 PPO_SETTINGS = dict(
     n_steps=64,
     batch_size=16,
@@ -25,7 +25,7 @@ COEF = 30.0
 
 
 def rewritten(method, *replacements):
-    """``method`` with each original replaced, further lines at its indentation; fails when SB3 has changed one of them."""
+    """``method`` with each original replaced, all lines at its indentation; fails when SB3 has changed an original."""
     source = textwrap.dedent(inspect.getsource(method))
     for original, replacement in replacements:
         assert source.count(original) == 1, f"SB3 changed `{original}`"

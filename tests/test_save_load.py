@@ -72,7 +72,7 @@ def test_continues_as_if_never_stopped(tmp_path, name, action_space, observation
     model.learn(2 * form.n_timesteps, callbacks[0])
     loaded, forgetful = (save_and_load(model, tmp_path, make_env()) for _ in range(2))
     assert {name: getattr(loaded, name) for name in arguments} == arguments
-    assert not differ(model, loaded)
+    assert_equal(model, loaded)
     # Without the reference batch the next update has no churn loss
     if form.callback:
         forgetful.churn_state["reducer"]["_extra_state"].update(reference=None, old_outputs=None)
