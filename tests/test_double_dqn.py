@@ -108,7 +108,7 @@ def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, mo
     models = []
     for own_pass in (False, True):
         monkeypatch.setattr(dqn_cchain, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
-        models.append(learn(n_timesteps=80, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
+        models.append(learn(n_timesteps=50, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
     for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.allclose(p, q, rtol=0, atol=1e-5)
     together, alone = (model.logger.name_to_value for model in models)

@@ -213,7 +213,7 @@ def test_a_compiled_policy_trains_and_loads_as_one_that_is_not(tmp_path, form, m
         if compiled:
             model.policy = th.compile(model.policy, backend="eager")
         callbacks = [callback] * (callback is not None) + [ChurnMonitor(interval=3)] * monitor
-        models.append(model.learn(96, callback=callbacks))
+        models.append(model.learn(form.n_timesteps, callback=callbacks))
         logged.append(dict(model.logger.name_to_value))
     plain, compiled = models
     assert logged[0] == logged[1]
