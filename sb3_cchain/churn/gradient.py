@@ -6,6 +6,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_cchain.replaced import replaced
+
 
 @contextmanager
 def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) -> Iterator[None]:
@@ -22,17 +24,10 @@ def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) 
     :param backward: Adds its gradient to the parameters' ``.grad``, for instance ``lambda: extra_loss().backward()``
     """
     zero_grad = optimizer.zero_grad
-    outer = vars(optimizer).get("zero_grad")
 
     def zero_grad_and_backward(*args: Any, **kwargs: Any) -> None:
         zero_grad(*args, **kwargs)
         backward()
 
-    optimizer.zero_grad = zero_grad_and_backward  # type: ignore[method-assign]
-    try:
+    with replaced(optimizer, "zero_grad", zero_grad_and_backward):
         yield
-    finally:
-        if outer is None:
-            del optimizer.zero_grad
-        else:
-            optimizer.zero_grad = outer  # type: ignore[method-assign]
