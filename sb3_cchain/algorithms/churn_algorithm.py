@@ -105,6 +105,12 @@ class ChurnAlgorithm(BaseAlgorithm):
         if self.reset_churn_coef and self._task_switch.happened(step_task(self, infos)):
             self.churn_reducer.coefficient.reset()
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if "churn_reducer" in state:
+            # A copy, by pickle or deepcopy: `churn_state` became a dict of that moment, and has to follow the copy's training
+            keep_churn_state(self, self.churn_reducer, self._task_switch)
+
     def _excluded_save_params(self) -> list[str]:
         # They are in `churn_state`
         return [*super()._excluded_save_params(), "churn_reducer", "_task_switch"]

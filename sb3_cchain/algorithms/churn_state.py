@@ -1,19 +1,19 @@
 """Keeps the state of churn reduction with the model, so that it is saved and training goes on with the same λ."""
 
-from copy import deepcopy
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cchain.churn import ChurnReducer
-from sb3_cchain.tasks.sync import TaskSwitch
+from sb3_cchain.tasks.signal import TaskSwitch
 
 
 class ChurnState:
     """
-    Stands as ``churn_state`` among a model's attributes, which SB3 pickles into the saved file. There it becomes a dict of
-    tensors and numbers. A stock algorithm loads it as one more attribute and ignores it, without this package, too.
+    Stands as ``churn_state`` among a model's attributes, which SB3 pickles into the saved file. There, and in a copy of the
+    model, it becomes a dict of tensors and numbers. A stock algorithm loads it as one more attribute and ignores it, without
+    this package, too.
 
     :param model: The model
     :param reducer: Its churn reducer
@@ -39,11 +39,6 @@ class ChurnState:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (list(self.as_dict().items()),)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ChurnState":
-        copied = ChurnState(deepcopy(self.model, memo), deepcopy(self.reducer, memo), deepcopy(self.task_switch, memo))
-        copied.n_updates = self.n_updates
-        return copied
 
 
 def keep_churn_state(

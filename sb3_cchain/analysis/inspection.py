@@ -26,7 +26,7 @@ from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
-from sb3_cchain.tasks.sync import is_continual
+from sb3_cchain.tasks.signal import is_continual
 from sb3_cchain.validation import check_number
 
 # Drawn for each group of layers, by their names after "health/"

@@ -1,0 +1,61 @@
+"""Copies of a model, by pickle or deepcopy, are models of their own: what they save is their own state."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
+from tests.envs import RandomEnv
+
+
+def make_ppo():
+    return CChainPPO("MlpPolicy", RandomEnv(), n_steps=16, batch_size=8, n_epochs=1, churn_warmup=0, device="cpu")
+
+
+def make_dqn():
+    return CChainDQN("MlpPolicy", RandomEnv(), learning_starts=4, batch_size=8, buffer_size=100, device="cpu")
+
+
+def pickled(model):
+    return pickle.loads(pickle.dumps(model))
+
+
+# After training, deepcopy fails for PPO's policy as it does for SB3's own: it keeps its last distribution
+@pytest.mark.parametrize("make, duplicate", [(make_ppo, pickled), (make_dqn, pickled), (make_dqn, copy.deepcopy)])
+def test_a_copy_goes_on_and_saves_what_it_learned(make, duplicate, tmp_path):
+    model = make().learn(48)
+    n_seen = int(model.churn_reducer.coefficient.n_seen)
+    other = duplicate(model)
+    assert int(other.churn_reducer.coefficient.n_seen) == n_seen > 0
+    other.learn(48, reset_num_timesteps=False)
+    other.save(tmp_path / "model")
+    assert int(model.churn_reducer.coefficient.n_seen) == n_seen
+
+    loaded = type(model).load(tmp_path / "model")
+    saved, kept = loaded.churn_reducer, other.churn_reducer
+    assert int(saved.coefficient.n_seen) == int(kept.coefficient.n_seen) > n_seen
+    assert saved.coefficient.value == kept.coefficient.value
+    assert np.array_equal(saved.reference, kept.reference)
+
+
+@pytest.mark.parametrize("make", [make_ppo, make_dqn])
+def test_an_untrained_copy_has_a_reducer_of_its_own(make):
+    model = make()
+    other = copy.deepcopy(model)
+    assert other.churn_state.model is other and other.churn_state.reducer is other.churn_reducer is not model.churn_reducer
+    other.learn(48)
+    assert int(other.churn_reducer.coefficient.n_seen) > 0 == int(model.churn_reducer.coefficient.n_seen)
+
+
+def test_a_stock_model_that_was_pickled_goes_on_with_the_callback(tmp_path):
+    model = PPO("MlpPolicy", RandomEnv(), n_steps=16, batch_size=8, n_epochs=1, device="cpu").learn(48, CChainCallback())
+    other, callback = pickled(model), CChainCallback()
+    other.learn(32, callback, reset_num_timesteps=False)
+    assert int(callback.churn_reducer.coefficient.n_seen) == 5
+    other.save(tmp_path / "model")
+    callback = CChainCallback()
+    PPO.load(tmp_path / "model", RandomEnv()).learn(16, callback, reset_num_timesteps=False)
+    assert int(callback.churn_reducer.coefficient.n_seen) == 6
