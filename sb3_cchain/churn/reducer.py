@@ -8,7 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_cchain.churn.coefficient import ChurnCoefficient
-from sb3_cchain.churn.divergence import Divergence
+from sb3_cchain.churn.divergence import Divergence, mean_squared_difference
 
 Observations = th.Tensor | dict[str, th.Tensor]
 
@@ -60,7 +60,7 @@ class ChurnReducer(nn.Module):
         self.old_outputs: th.Tensor | None = None
         # The churn loss of each update since the last `end_iteration()`
         self.losses: list[float] = []
-        # Over the samples since the last `end_iteration()`: their number, and the sum of the loss beyond that of no change
+        # The samples since the last `end_iteration()`: their number, and the sum of their loss minus the loss without churn
         self._n_samples, self._churn_sum = 0, 0.0
 
     def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> None:
@@ -96,9 +96,12 @@ class ChurnReducer(nn.Module):
         loss = churn_loss.item()
         _check_finite(loss, self._coef, th.finfo(churn_loss.dtype).max)
         self.losses.append(loss)
-        n_samples = len(new_outputs)
-        self._n_samples += n_samples
-        self._churn_sum += n_samples * (loss - self.divergence(self.old_outputs, self.old_outputs).item())
+        if self.divergence is mean_squared_difference:
+            loss_without_churn = 0.0  # not computed, which would take several per cent of an update of DQN
+        else:
+            loss_without_churn = self.divergence(self.old_outputs, self.old_outputs).item()
+        self._n_samples += len(new_outputs)
+        self._churn_sum += len(new_outputs) * (loss - loss_without_churn)
         return self._coef * churn_loss
 
     def remember(self, reference: Observations, outputs: th.Tensor | None = None) -> None:
