@@ -97,7 +97,7 @@ class ChurnReducer(nn.Module):
         _check_finite(loss, self._coef, th.finfo(churn_loss.dtype).max)
         self.losses.append(loss)
         if self.divergence is mean_squared_difference:
-            loss_without_churn = 0.0  # not computed, which would take several per cent of an update of DQN
+            loss_without_churn = 0.0  # not computed, because each update of DQN would pay for it
         else:
             loss_without_churn = self.divergence(self.old_outputs, self.old_outputs).item()
         self._n_samples += len(new_outputs)
