@@ -18,25 +18,27 @@ if TYPE_CHECKING:
 
 # Pixels of a frame per pixel of an observation and direction
 FRAME_SCALE = 8
-# Procgen's own names, here so that it need not be installed to know them
-GAMES = (
-    "bigfish",
-    "bossfight",
-    "caveflyer",
-    "chaser",
-    "climber",
-    "coinrun",
-    "dodgeball",
-    "fruitbot",
-    "heist",
-    "jumper",
-    "leaper",
-    "maze",
-    "miner",
-    "ninja",
-    "plunder",
-    "starpilot",
+# Of the environment ids. Here, so that procgen need not be installed to know them
+GAME_NAMES = (
+    "BigFish",
+    "BossFight",
+    "CaveFlyer",
+    "Chaser",
+    "Climber",
+    "CoinRun",
+    "Dodgeball",
+    "FruitBot",
+    "Heist",
+    "Jumper",
+    "Leaper",
+    "Maze",
+    "Miner",
+    "Ninja",
+    "Plunder",
+    "Starpilot",
 )
+# Procgen's own names
+GAMES = tuple(name.lower() for name in GAME_NAMES)
 # The games of each mode. Procgen ends the process where a game does not have the mode. Its "exploration" is left out: it is
 # the hard mode on one certain level, which leaves no choice of levels.
 DISTRIBUTION_MODES = {

@@ -2,29 +2,13 @@
 
 import gymnasium as gym
 
+from sb3_cchain.envs.procgen import GAME_NAMES
+
 # Keyword arguments of `gymnasium.register` by the id without its namespace. `kwargs` holds only arguments that differ from
 # the defaults of the entry point; each of them can be given to `gymnasium.make`, too.
 _GYM_CONTROL = {"entry_point": "sb3_cchain.envs.gym_control:ContinualGymControl", "max_episode_steps": 400}
 _DM_CONTROL = "sb3_cchain.envs.dm_control:ContinualDMControl"
 _PROCGEN = "sb3_cchain.envs.procgen:ContinualProcgen"
-_PROCGEN_GAMES = (
-    "BigFish",
-    "BossFight",
-    "CaveFlyer",
-    "Chaser",
-    "Climber",
-    "CoinRun",
-    "Dodgeball",
-    "FruitBot",
-    "Heist",
-    "Jumper",
-    "Leaper",
-    "Maze",
-    "Miner",
-    "Ninja",
-    "Plunder",
-    "Starpilot",
-)
 CONTINUAL_ENVS: dict[str, dict] = {
     "CartPole-v1": {**_GYM_CONTROL, "kwargs": {"env_id": "CartPole-v1"}},
     "Acrobot-v1": {**_GYM_CONTROL, "kwargs": {"env_id": "Acrobot-v1"}},
@@ -38,7 +22,7 @@ CONTINUAL_ENVS: dict[str, dict] = {
     "Walker-v0": {"entry_point": _DM_CONTROL, "kwargs": {"domain": "walker", "tasks": ["stand", "walk", "run"]}},
     "Quadruped-v0": {"entry_point": _DM_CONTROL, "kwargs": {"domain": "quadruped", "tasks": ["walk", "run", "walk"]}},
     "Dog-v0": {"entry_point": _DM_CONTROL, "kwargs": {"domain": "dog", "tasks": ["stand", "walk", "run", "trot"]}},
-    **{f"{game}-v0": {"entry_point": _PROCGEN, "kwargs": {"game": game.lower()}} for game in _PROCGEN_GAMES},
+    **{f"{game}-v0": {"entry_point": _PROCGEN, "kwargs": {"game": game.lower()}} for game in GAME_NAMES},
 }
 
 
