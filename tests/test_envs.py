@@ -438,11 +438,11 @@ def test_two_normalised_environments_after_each_other(normalise):
     assert envs[1].obs_rms.count > 16
 
 
-def test_callbacks_of_ones_own_kind_are_not_added_twice():
+def test_callbacks_of_a_derived_class_are_not_added_twice():
     class Mine(ContinualMetrics):
         pass
 
-    given = with_continual_callbacks(Mine(), make_vec_env(three_tasks))
+    given = with_continual_callbacks([Mine()], make_vec_env(three_tasks))
     assert [type(callback) for callback in given] == [TaskSync, Mine]
 
 

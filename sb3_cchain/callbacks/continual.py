@@ -1,7 +1,6 @@
 """What an algorithm adds by itself when its environment is continual."""
 
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
@@ -9,20 +8,14 @@ from sb3_cchain.tasks.signal import is_continual
 from sb3_cchain.tasks.sync import TaskSync, iterate_callbacks
 
 
-def with_continual_callbacks(callback: MaybeCallback, env: VecEnv | None) -> MaybeCallback:
+def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> list[BaseCallback]:
     """
-    :param callback: What the user gave to ``learn()``
+    :param given: The callbacks of ``learn()``
     :param env: The training environment
     :return: The same, preceded in a continual environment by the callbacks for it that are not yet there
     """
     if not is_continual(env):
-        return callback
-    if callback is None:
-        given: list[BaseCallback] = []
-    elif isinstance(callback, list):
-        given = callback
-    else:
-        given = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+        return given
     present = list(iterate_callbacks(CallbackList(given)))
     needed = (TaskSync, ContinualMetrics)
     return [make() for make in needed if not any(isinstance(callback, make) for callback in present)] + given
