@@ -115,7 +115,6 @@ def _with_actions(policy: Any, actions: th.Tensor, values: th.Tensor) -> ModelOu
 
 
 def _q_network_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    # Not `model.q_net`, which is replaced while churn is reduced
     return _with_greedy_actions(policy.q_net(batch["observations"]))
 
 
