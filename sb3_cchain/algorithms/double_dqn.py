@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from sb3_cchain.algorithms.off_policy import finite_td_loss
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
+from sb3_cchain.validation import check_bool
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
@@ -64,8 +65,7 @@ class DoubleDQN(DQN):
         super().__init__(policy, env, *args, **kwargs)
 
     def _check_arguments(self) -> None:
-        if not isinstance(self.double_q, bool):
-            raise TypeError(f"`double_q` must be True or False, got {self.double_q!r}")
+        check_bool("double_q", self.double_q)
         if self.loss not in tuple(LOSSES):
             raise ValueError(f'`loss` must be "huber" or "mse", got {self.loss!r}')
 

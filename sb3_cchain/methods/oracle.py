@@ -8,6 +8,7 @@ from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
+from sb3_cchain.validation import check_bool
 
 add_charts("Related methods", {"Oracle: resets": "oracle/n_resets"})
 
@@ -38,8 +39,7 @@ class Oracle(TaskBoundary):
 
     def __init__(self, reset_replay_buffer: bool = False):
         super().__init__()
-        if not isinstance(reset_replay_buffer, bool):
-            raise TypeError(f"`reset_replay_buffer` must be True or False, got {reset_replay_buffer!r}")
+        check_bool("reset_replay_buffer", reset_replay_buffer)
         self.reset_replay_buffer = reset_replay_buffer
 
     def _init_callback(self) -> None:
