@@ -1,5 +1,7 @@
 """The clock that says which task is due, and the signal that it has switched."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -76,3 +78,10 @@ def test_another_environment_resets_the_coefficient(as_callback, reset):
         model.learn(32, callback=callback, reset_num_timesteps=False)
         n_seen.append(int((callback or model).churn_reducer.coefficient.n_seen))
     assert n_seen == [2, 4, 2 if reset else 6]
+
+
+@pytest.mark.parametrize("make", [CChainCallback, partial(CChainPPO, "MlpPolicy", "CartPole-v1")])
+def test_the_reset_of_the_coefficient_is_a_boolean(make):
+    for value in ("False", 0, None):
+        with pytest.raises(TypeError, match=f"`reset_churn_coef` must be True or False, got {value!r}"):
+            make(reset_churn_coef=value)

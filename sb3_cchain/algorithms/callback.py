@@ -12,6 +12,7 @@ from sb3_cchain.churn import make_coefficient
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tasks.sync import iterate_callbacks
 from sb3_cchain.tensorboard.overview import add_overview
+from sb3_cchain.validation import check_bool
 
 # Methods of the model that are replaced from the end of a rollout to train()
 REPLACED = ("train", "_excluded_save_params")
@@ -42,7 +43,7 @@ class CChainCallback(FiniteCheck):
     :param churn_component: As for ``CChainPPO``
     :raises ValueError: Naming the argument that is out of its range; when training starts, for a second CChainCallback in the
         same ``learn()``, and for one that another callback holds
-    :raises TypeError: When training starts, for a model that is not a stock PPO
+    :raises TypeError: When ``reset_churn_coef`` is not a boolean; when training starts, for a model that is not a stock PPO
     """
 
     model: PPO
@@ -68,6 +69,7 @@ class CChainCallback(FiniteCheck):
             minimum=churn_coef_min,
         )
         self._make_coefficient(default_target_ratio=1.0)  # raise on bad values now
+        check_bool("reset_churn_coef", reset_churn_coef)
         check_choices(churn_base_loss, churn_component)
         self.churn_base_loss = churn_base_loss
         self.churn_component = churn_component
@@ -79,18 +81,22 @@ class CChainCallback(FiniteCheck):
             raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
         if hasattr(self.model, "churn_reducer"):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
-        if isinstance(self.parent, EventCallback):
-            raise ValueError(
-                f"CChainCallback must be called at every rollout, but {type(self.parent).__name__} holds it: "
-                "give it to `learn()` beside the other callbacks"
-            )
+        self._check_parent()
         add_overview(self.model)
         self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
         past, n_updates = vars(self.model).get("churn_state"), self.model._n_updates
         self._state = keep_churn_state(self.model, self.churn_reducer, self._task_switch, past, n_updates)
         self._state.n_updates = n_updates
 
+    def _check_parent(self) -> None:
+        if isinstance(self.parent, EventCallback):
+            raise ValueError(
+                f"CChainCallback must be called at every rollout, but {type(self.parent).__name__} holds it: "
+                "give it to `learn()` beside the other callbacks"
+            )
+
     def _on_training_start(self) -> None:
+        self._check_parent()  # again: SB3 initialises the callbacks in a list before it tells them their parent
         n_callbacks = sum(isinstance(callback, CChainCallback) for callback in iterate_callbacks(self.locals["callback"]))
         if n_callbacks > 1:
             raise ValueError(

@@ -15,6 +15,7 @@ from sb3_cchain.callbacks.continual import with_continual_callbacks
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
+from sb3_cchain.validation import check_bool
 
 
 class ChurnAlgorithm(BaseAlgorithm):
@@ -36,6 +37,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         released with the paper. Off by default, because C-CHAIN does not need to be told of a switch.
     :param kwargs: Keyword arguments of the base algorithm
     :raises ValueError: Naming the churn argument that is out of its range
+    :raises TypeError: When ``reset_churn_coef`` is not a boolean
     """
 
     churn_reducer: ChurnReducer
@@ -58,6 +60,7 @@ class ChurnAlgorithm(BaseAlgorithm):
         self.churn_coef_min = churn_coef_min
         self.reset_churn_coef = reset_churn_coef
         # Raise on bad values before an environment is made
+        check_bool("reset_churn_coef", reset_churn_coef)
         self._make_churn_coefficient(default_target_ratio=1.0)
         self._task_switch = TaskSwitch()
         self._is_first_training = True
