@@ -13,6 +13,7 @@ from sb3_cchain.analysis.ntk import policy_ntk, q_ntk
 from sb3_cchain.analysis.plots import import_matplotlib, plot_ntk
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
+from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.validation import check_number
 
 # When `picture_interval` is not given
@@ -95,10 +96,8 @@ class NTKCallback(TrainingInterval):
         super()._on_training_start()
         if self.picture_interval is None:
             self.picture_interval = self._default_picture_interval()
-        # The logger of a model without `tensorboard_log` writes to a temporary folder, another one in each `learn()`
-        has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
-        folder = self.logger.get_dir() if has_folder else None
-        self._folder = self.path or (Path(folder) / "ntk" if folder is not None else None)
+        folder = log_folder(self.model)
+        self._folder = self.path or (folder / "ntk" if folder is not None else None)
 
     def _default_picture_interval(self) -> int:
         try:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.tensorboard.overview import add_overview
@@ -25,7 +26,7 @@ class ContinualMetrics(BaseCallback):
     - ``continual/average_performance``: :math:`J(\mathbb{T})` so far, the mean of those over the tasks (Eq. 1 of the C-CHAIN
       paper)
 
-    Rewards and returns are the environment's own, whatever scales or normalises the rewards that the agent learns from.
+    Rewards and returns are the environment's own, also where the agent learns from scaled or normalised rewards.
     A rollout in which no episode ends does not count; off-policy algorithms, whose rollouts are the few steps between two
     updates, have a row per episode. An episode that is cut by a switch counts with its return up to there.
 
@@ -70,7 +71,8 @@ class ContinualMetrics(BaseCallback):
         self.model.continual_state = self._state  # type: ignore[attr-defined]
         self._switch = TaskSwitch(state["task_id"])
 
-        path = self._find_path()
+        folder = log_folder(self.model)
+        path = self.path or (folder / RETURNS_CSV if folder is not None else None)
         past = [] if is_new else getattr(self.model, "continual_returns", [])
         if not past and not is_new and path is not None and path.exists():
             past = read_returns(path)
@@ -91,12 +93,6 @@ class ContinualMetrics(BaseCallback):
         self._vec_normalize = self.model.get_vec_normalize_env()
         self._returns = np.zeros(self.training_env.num_envs)
         self._rollout_reward, self._rollout_steps = 0.0, 0
-
-    def _find_path(self) -> Path | None:
-        # The logger of a model without `tensorboard_log` writes to a temporary folder, another at each `learn()`
-        has_folder = self.model.tensorboard_log is not None or self.model._custom_logger
-        folder = self.logger.get_dir() if has_folder else None
-        return self.path or (Path(folder) / RETURNS_CSV if folder is not None else None)
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], self.locals["dones"]
