@@ -42,7 +42,7 @@ def test_rollouts(n_envs=2):
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=4, gamma=1.0, normalize_advantage=False, device="cpu", seed=0)
     model.learn(2 * 10 * n_envs, callback=[EpisodicRollouts(), spy])
     for episode_starts, advantages, returns in spy.rollouts:
-        assert np.flatnonzero(episode_starts[:, 0]).tolist() == [0, 7]  # the second rollout begins anew
+        assert np.flatnonzero(episode_starts[:, 0]).tolist() == [0, 7]  # the second rollout begins with an episode
         assert np.allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-5)
         assert returns[:7, 0].tolist() == [7, 6, 5, 4, 3, 2, 1]
         assert np.allclose(np.diff(returns[7:, 0]), -1)  # and then the value of the last observation

@@ -102,7 +102,7 @@ def test_training_without_the_callback_is_plain_training(tmp_path, name, algorit
     assert attached(model) == before
 
 
-def test_when_training_begins_anew_and_reaches_the_same_step():
+def test_when_training_begins_again_and_reaches_the_same_step():
     """Where the number of steps alone does not tell the trainings apart."""
     model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=16, n_epochs=1, seed=0, device="cpu")
     monitors = [NetworkHealth(interval=1), ChurnMonitor(interval=1), shrink := methods.ShrinkAndPerturb(0.5)]

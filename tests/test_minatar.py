@@ -260,7 +260,7 @@ class Rewards(gym.Env):
 )
 def test_no_reward_limit(rewards, truncated):
     env = NoRewardLimit(Rewards(rewards), 3)
-    for _ in range(2):  # counted anew in each episode
+    for _ in range(2):  # counted from 0 in each episode
         env.reset()
         assert [env.step(0)[3] for _ in rewards] == truncated
 

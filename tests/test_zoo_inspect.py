@@ -82,7 +82,7 @@ def test_what_is_no_model_that_can_be_inspected(write, message, tmp_path, capsys
         (DQN, "ppo", "it was not saved by PPO (its policy is a DQNPolicy): --algo ppo"),
         (PPO, "dqn", "it was not saved by DQN (its policy is a ActorCriticPolicy): --algo dqn"),
         (DQN, "qrdqn", "it was not saved by QRDQN (its policy is a DQNPolicy): --algo qrdqn"),
-        (PPO, "a2c", "it was saved by PPO, not by A2C: leave --algo a2c away"),
+        (PPO, "a2c", "it was saved by PPO, not by A2C: leave out --algo a2c"),
     ],
 )
 def test_the_wrong_algorithm(saved_by, algo, message, tmp_path, capsys):

@@ -183,7 +183,7 @@ def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
     """
     :param algo: Name of the algorithm on the command line
     :param env_id: Environment id
-    :return: What our YAML file says about the environment, None where it says nothing
+    :return: What the shipped YAML file says about the environment, None where it says nothing
     """
     return _read_yaml(ROOT / "zoo_hyperparams" / f"{algo}.yml").get(env_id)
 

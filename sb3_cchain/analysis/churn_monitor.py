@@ -51,7 +51,7 @@ class ChurnMonitor(BaseCallback):
     change counts too. A window of several updates may span several calls of ``train()``; what happens between them counts.
 
     TRPO, whose policy no optimiser changes, and ARS are measured once per iteration instead, over the whole of its training,
-    whatever the interval; ARS on the last observations of its candidates.
+    and ``interval`` has no effect; ARS on the last observations of its candidates.
 
     The networks are measured in evaluation mode. Recurrent policies take each observation as the first of an episode; maskable
     ones have the batch's action masks.

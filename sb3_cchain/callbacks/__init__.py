@@ -1,4 +1,4 @@
-"""Callbacks for training in continual environments: the paper's rollouts, and how well the agent does."""
+"""Callbacks for training: the paper's rollouts, how well the agent does over the tasks, and what callbacks share."""
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts

@@ -91,7 +91,7 @@ class TrainingHooks:
 def _remove_last(handle: th.utils.hooks.RemovableHandle) -> None:
     """
     Remove a hook while the optimiser runs its hooks. This is allowed for the last of them only, because torch iterates over
-    the dictionary of hooks itself. Each step thus removes one hook of interrupted training.
+    the dictionary of hooks itself. Therefore each step removes one hook of interrupted training.
     """
     hooks = handle.hooks_dict_ref()
     if hooks is not None and next(reversed(hooks)) == handle.id:

@@ -15,7 +15,7 @@ class SafeCheckpointCallback(CheckpointCallback):
 
     def _on_step(self) -> bool:
         if self.n_calls % self.save_freq == 0:
-            # The model comes last, so that whatever belongs to it is there when it is
+            # The model comes last, so that all that belongs to it is there by then
             if self.save_replay_buffer and getattr(self.model, "replay_buffer", None) is not None:
                 with write_safely(self._checkpoint_path("replay_buffer_", "pkl")) as path:
                     self.model.save_replay_buffer(path)  # type: ignore[attr-defined]

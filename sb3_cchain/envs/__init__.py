@@ -1,4 +1,4 @@
-"""Continual environments: sequences of tasks as Gymnasium environments."""
+"""Continual environments: sequences of tasks as Gymnasium environments, and their normalisation."""
 
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.dm_control import ContinualDMControl, FlatDMControl

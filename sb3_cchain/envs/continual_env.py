@@ -106,7 +106,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
 
     def set_task(self, task_id: int) -> None:
         """
-        Stay on one task, whatever the number of steps, from the next ``reset()`` on: for evaluation.
+        Stay on one task from the next ``reset()`` on, for evaluation. Steps do not end it.
 
         :param task_id: The task, counted from 0
         :raises ValueError: When there is no such task

@@ -17,7 +17,7 @@ class ObservationOffset(gym.ObservationWrapper):
     """
     Adds a constant to each observation.
 
-    The observation space becomes unbounded, so that it is the same whatever the offset.
+    The observation space becomes unbounded, so that it is the same for all offsets.
 
     :param env: Environment with ``Box`` observations
     :param offset: What to add, of the observations' shape

@@ -1,4 +1,4 @@
-"""The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm."""
+"""The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm; the table of all methods."""
 
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.l2_init import L2Init

@@ -25,7 +25,7 @@ class TaskBoundary(BaseCallback):
 
     def _on_training_start(self) -> None:
         require_tasks(self)
-        # Training that begins at step 0 begins with its first task, whatever the model was trained on before
+        # Training that begins at step 0 begins with its first task, not with what the model was trained on before
         known = getattr(self.model, "trained_task_id", None) if self.num_timesteps > 0 else None
         self._switch = TaskSwitch(known)
         self._may_have_switched = True

@@ -57,7 +57,7 @@ class TaskClock:
 
     def pin(self, task_id: int) -> None:
         """
-        Make one task due, whatever the time is.
+        Make one task due at all times.
 
         :param task_id: The task, counted from 0
         :raises ValueError: When there is no such task

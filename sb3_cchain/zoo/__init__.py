@@ -1,1 +1,1 @@
-"""The command ``sb3-cchain``: RL Zoo's command line with our algorithms, methods and hyperparameters."""
+"""The command ``sb3-cchain``: RL Zoo's command line with the algorithms, methods and hyperparameters of this package."""

@@ -1,6 +1,6 @@
 """
-The command ``sb3-cchain``: RL Zoo's commands, which know our algorithms and the related methods and find our hyperparameters,
-and ``sb3-cchain inspect``.
+The command ``sb3-cchain``: RL Zoo's commands, with the algorithms, related methods and hyperparameters of this package, and
+``sb3-cchain inspect``.
 """
 
 import runpy
@@ -70,7 +70,7 @@ def for_playing(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
 
 
-def call_our_command(command: list[str], *args: Any, **kwargs: Any) -> int:
+def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
     """
     What ``subprocess.call`` is to RL Zoo's ``record_training`` and ``benchmark``, which start others of RL Zoo's commands.
 
@@ -144,7 +144,7 @@ def run_module(name: str) -> None:
         return {key: (algo, EnvironmentName(env_id)) for key, (algo, env_id) in get_trained_models(log_folder).items()}
 
     with (
-        replaced(subprocess, "call", call_our_command),
+        replaced(subprocess, "call", call_sb3_cchain),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
         warnings.catch_warnings(),
     ):

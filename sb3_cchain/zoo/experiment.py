@@ -162,7 +162,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
 def make_run_folder(parent: str | Path, name: str) -> Path:
     """
-    Make the next of the folders ``name_1``, ``name_2`` and so on. No two calls get the same, whatever processes they are in.
+    Make the next of the folders ``name_1``, ``name_2`` and so on. No two calls get the same, not even in two processes.
 
     :param parent: Folder to make it in
     :param name: Name without its number
@@ -180,7 +180,7 @@ def make_run_folder(parent: str | Path, name: str) -> Path:
 
 def statistics_path(model_path: str | Path, env_name: str) -> Path:
     """
-    :param model_path: A model saved by our ``train``
+    :param model_path: A model saved by ``sb3-cchain train``
     :param env_name: The environment's name in RL Zoo's folders
     :return: Where the statistics of its ``VecNormalize`` are: those of a checkpoint beside it, those of the final and of the
         best model in the folder of the settings

@@ -115,7 +115,7 @@ def load_as_trained(
     try:
         model = algorithm.load(path, env, device=device, **settings)
     except (AssertionError, AttributeError, KeyError, RuntimeError) as error:
-        # Whatever a file of another algorithm or version lacks
+        # A file of another algorithm or version lacks something
         raise ValueError(
             f"it cannot be loaded as {algorithm.__name__}: {error!r}. Give the --algo that it was saved by"
         ) from error
@@ -145,7 +145,7 @@ def check_algorithm(path: Path, data: dict[str, Any], algo: str) -> None:
     except ValueError:
         return  # it cannot be told
     if not (issubclass(saved_by, algorithm) or issubclass(algorithm, saved_by)):
-        raise ValueError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}: leave --algo {algo} away")
+        raise ValueError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}: leave out --algo {algo}")
 
 
 def main(arguments: Sequence[str]) -> None:

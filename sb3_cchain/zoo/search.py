@@ -1,4 +1,4 @@
-"""What ``sb3-cchain train -optimize`` searches for our algorithms and for the related methods."""
+"""What ``sb3-cchain train -optimize`` searches for the algorithms of this package and for the related methods."""
 
 from collections.abc import Callable
 from typing import Any
@@ -92,7 +92,7 @@ def refuse_trial(sampled_params: dict[str, Any]) -> dict[str, Any]:
     raise ValueError(f"`--trial-id` cannot put {sampled_params} into the settings: give a YAML file of your own, -conf FILE")
 
 
-# By class, RL Zoo's and those of our algorithms that differ from them
+# By class, RL Zoo's, and those of this package that differ from them
 _SEARCH_SPACES: dict[type[BaseAlgorithm], tuple[Sampler, Converter]] = {
     **{ALGOS[name]: (HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name]) for name in HYPERPARAMS_SAMPLER},
     DoubleDQN: (sample_double_dqn_params, convert_double_dqn_params),
@@ -104,7 +104,7 @@ def register_search_spaces() -> None:
     """Make the search spaces of all methods known to RL Zoo, in place."""
     for method in REGISTRY:
         if method.grid:
-            HYPERPARAMS_SAMPLER[method.algo] = lambda *_: {}  # our ExperimentManager searches the grid
+            HYPERPARAMS_SAMPLER[method.algo] = lambda *_: {}  # zoo/experiment.py searches the grid
             HYPERPARAMS_CONVERTER[method.algo] = refuse_trial
         elif not method.is_related and method.algo not in _RL_ZOO_NAMES:
             # That of the nearest base that has one

@@ -1,4 +1,4 @@
-"""The settings of a training run: our YAML files, and what RL Zoo saved beside a model."""
+"""The settings of a training run: the YAML files of this package, and what RL Zoo saved beside a model."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 
 def hyperparams_folder() -> Path:
     """
-    :return: The folder of our YAML files: inside the installed package, at the root of a checkout
+    :return: The folder of the YAML files: inside the installed package, at the root of a checkout
     """
     package = Path(__file__).parent.parent
     inside = package / "zoo_hyperparams"
@@ -51,9 +51,9 @@ def _rl_zoo_has_settings(algo: str) -> bool:
 def add_settings_file(arguments: list[str]) -> list[str]:
     """
     :param arguments: Arguments of RL Zoo's ``train``
-    :return: The same, with our YAML file where we have one
-    :raises SystemExit: When one of our names has no settings for the environment, or is to be optimised and has nothing to
-        search
+    :return: The same, with the YAML file of this package where there is one
+    :raises SystemExit: When an algorithm of this package has no settings for the environment, or is to be optimised and has
+        nothing to search
     """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="ppo")
