@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_cchain import CChainCallback, CChainPPO
+from sb3_cchain import CChainCallback, CChainPPO, ContinualMetrics
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.tasks.signal import TaskSwitch
 from tests.envs import CountEnv
@@ -85,3 +85,12 @@ def test_the_reset_of_the_coefficient_is_a_boolean(make):
     for value in ("False", 0, None):
         with pytest.raises(TypeError, match=f"`reset_churn_coef` must be True or False, got {value!r}"):
             make(reset_churn_coef=value)
+
+
+def test_an_environment_that_comes_again_is_a_new_task():
+    worlds = [CountEnv(), CountEnv()]
+    model, metrics = CChainPPO("MlpPolicy", worlds[0], **SETTINGS), ContinualMetrics()
+    for world in (worlds[0], worlds[0], worlds[1], worlds[0]):
+        model.set_env(world)
+        model.learn(16, callback=metrics, reset_num_timesteps=False)
+    assert list(dict.fromkeys(row["task_id"] for row in metrics.rows)) == [0, 1, 2]

@@ -5,7 +5,8 @@ Callbacks, methods, metrics and the reset of λ all listen to it: each of them k
 present task, as :func:`step_task` or :func:`episode_task` tell it. Both ask the same sources, in this order:
 
 1. The environment, which numbers its tasks in ``info["task_id"]``, as :class:`~sb3_cchain.ContinualEnv` does.
-2. The model's ``set_env()``: where the environment gives no number, each environment that the model is trained in is one task.
+2. The model's ``set_env()``: where the environment gives no number, the next task begins when the model is trained in another
+   environment than before. An environment that comes again is a new task, too.
 
 Another source of switches (a call by the user, a test that detects them) belongs here, in ``_task``.
 """
@@ -76,7 +77,7 @@ _last_envs: WeakKeyDictionary[BaseAlgorithm, ref[Any]] = WeakKeyDictionary()
 
 
 def _env_number(model: BaseAlgorithm) -> int:
-    """How many environments the model was trained in before this one. The number is kept as ``model.env_number``."""
+    """How often the model has changed to another environment. The number is kept as ``model.env_number``."""
     assert model.env is not None
     env = model.env.unwrapped
     # set_env() wraps the same environment again
