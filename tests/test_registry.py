@@ -16,6 +16,7 @@ from benchmarks.grid.run import suite_methods
 from benchmarks.grid.suites import SUITES
 from sb3_cchain import methods
 from sb3_cchain.algorithms import CChainDQN, CChainPPO
+from sb3_cchain.analysis import NetworkHealth
 from sb3_cchain.methods import OptimizerMetrics, OptimizerWrapper, Penalty
 from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY
 from tests.method_models import go_on, make_env, make_method
@@ -182,3 +183,18 @@ def test_trains_saves_and_loads(tmp_path, method, with_c_chain):
     pairs = list(zip(model.policy.parameters(), loaded.policy.parameters(), strict=True))
     assert all(th.equal(one, other) for one, other in pairs)
     assert any(not th.equal(old, new) for old, (new, _) in zip(before, pairs, strict=True))
+
+
+@ROWS
+def test_a_compiled_policy_learns_as_the_policy(method):
+    models = []
+    for compiled in (False, True):
+        model, callbacks = make_method(method, with_c_chain=False)
+        if compiled:
+            model.policy = th.compile(model.policy, backend="eager")
+        models.append(model.learn(48, callback=[*callbacks, NetworkHealth(interval=1)], log_interval=1000))
+    plain, compiled = models
+    pairs = zip(plain.policy.parameters(), compiled.policy.parameters(), strict=True)
+    assert all(th.equal(one, other) for one, other in pairs)
+    logged = [{tag for tag in model.logger.name_to_value if tag.startswith(("health/", "redo/"))} for model in models]
+    assert logged[0] == logged[1]

@@ -17,6 +17,7 @@ from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.metrics.rank import effective_rank, singular_values, srank
 from sb3_cchain.analysis.model_outputs import evaluation_mode
 from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
+from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.forward_hooks import forward_hooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
@@ -66,7 +67,7 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
     :return: Each figure under its name over all groups, except for the ranks, which belong to one matrix; and for each group
         that has it, as ``dormant_share/mlp_extractor.policy_net``. The policy keeps its training mode.
     """
-    return {**_unit_health(model.policy, observations, tau), **_parameter_health(model)}
+    return {**_unit_health(uncompiled(model.policy), observations, tau), **_parameter_health(model)}
 
 
 def trained_groups(model: BaseAlgorithm) -> dict[str, dict[str, nn.Parameter]]:
@@ -77,10 +78,11 @@ def trained_groups(model: BaseAlgorithm) -> dict[str, dict[str, nn.Parameter]]:
     groups: dict[str, dict[str, nn.Parameter]] = {}
     optimizers = model_optimizers(model).values()
     trained = {parameter for optimizer in optimizers for group in optimizer.param_groups for parameter in group["params"]}
-    for name, parameter in model.policy.named_parameters():
+    policy = uncompiled(model.policy)
+    for name, parameter in policy.named_parameters():
         if parameter in trained:
             layer, _, _ = name.rpartition(".")
-            is_layer = not any(model.policy.get_submodule(layer).children())
+            is_layer = not any(policy.get_submodule(layer).children())
             groups.setdefault(_group(layer if is_layer else name), {})[name] = parameter
     return groups
 

@@ -24,6 +24,7 @@ from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.health import trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.plots import plot_models
+from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.signal import is_continual
@@ -143,7 +144,7 @@ def _check_model(model: BaseAlgorithm) -> None:
         raise ValueError(
             f"The model has no environment: load it with one, {name}.load(path, env), or give it one by set_env(env)"
         )
-    for name, parameter in model.policy.named_parameters():
+    for name, parameter in uncompiled(model.policy).named_parameters():
         if not parameter.isfinite().all():
             raise ValueError(f"The model cannot act: its parameter {name} has entries that are infinite or not a number")
 

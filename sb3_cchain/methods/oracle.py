@@ -6,6 +6,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
+from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_bool
@@ -55,12 +56,12 @@ class Oracle(TaskBoundary):
         self.n_resets = 0
 
     def _on_task_switch(self) -> None:
-        policy, fresh = self.model.policy, fresh_policy(self.model)
+        policy, fresh = uncompiled(self.model.policy), fresh_policy(self.model)
         policy.load_state_dict(fresh.state_dict())
         policy.optimizer.load_state_dict(fresh.optimizer.state_dict())
         if isinstance(self.model, OnPolicyAlgorithm) and self.model.use_sde:
             # The rollout's exploration noise has been drawn from the standard deviation that is gone
-            self.model.policy.reset_noise(self.model.n_envs)
+            policy.reset_noise(self.model.n_envs)
         if self.reset_replay_buffer:
             assert isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None
             self.model.replay_buffer.reset()

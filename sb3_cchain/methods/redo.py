@@ -16,6 +16,7 @@ from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units, hidden_activity
+from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -91,7 +92,7 @@ class ReDo(TrainingInterval):
         self.n_recycled = 0
         self._observations: PyTorchObs | None = None
         self.model.policy.set_training_mode(False)
-        self._layers = find_hidden_units(self.model.policy, self._forward(_zeros(self.model)))
+        self._layers = find_hidden_units(uncompiled(self.model.policy), self._forward(_zeros(self.model)))
         if not self._layers:
             raise ValueError(f"ReDo finds no hidden unit with outgoing weights of its own in {self.model.policy}")
 
@@ -115,11 +116,11 @@ class ReDo(TrainingInterval):
     def _forward(self, observations: PyTorchObs) -> Callable[[], Any]:
         if isinstance(self.model, DQN):
             return partial(self.model.q_net, observations)
-        policy = self.model.policy
+        policy = uncompiled(self.model.policy)
         return lambda: (policy.get_distribution(observations), policy.predict_values(observations))
 
     def _recycle(self, observations: PyTorchObs) -> None:
-        policy = self.model.policy
+        policy = uncompiled(self.model.policy)
         activity = hidden_activity(policy, self._layers, self._forward(observations))
         dormant = [dormant_scores(layer_activity) <= self.tau for layer_activity in activity]
         n_dormant = sum(int(units.sum()) for units in dormant)

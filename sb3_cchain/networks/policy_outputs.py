@@ -19,6 +19,7 @@ from torch.distributions import Bernoulli, Categorical
 from torch.nn import functional as F
 
 from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_squared_difference
+from sb3_cchain.networks.compiled import uncompiled
 
 # β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
 # of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
@@ -38,14 +39,6 @@ _MODE_FREE_PACKAGES = (
     "torch.nn.modules.pooling",
 )
 _MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
-
-
-def uncompiled(policy: nn.Module) -> nn.Module:
-    """
-    :param policy: A policy
-    :return: The policy itself, without the wrapper of ``torch.compile()``
-    """
-    return getattr(policy, "_orig_mod", policy)
 
 
 def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
