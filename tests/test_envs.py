@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
-from sb3_cchain.callbacks.continual import with_continual_callbacks
+from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.envs import ObservationOffset, RewardScale, TaskVecNormalize
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 from tests.envs import CountEnv, RandomEnv

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
 from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
-from sb3_cchain.callbacks.continual import with_continual_callbacks
+from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview

@@ -1,4 +1,4 @@
-"""The table of registered environments. A new suite needs a file of its own and an entry here."""
+"""The table of registered environments."""
 
 import gymnasium as gym
 

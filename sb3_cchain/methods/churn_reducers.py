@@ -1,9 +1,9 @@
-"""C-CHAIN together with other methods."""
+"""Finds what reduces churn in a training, so that methods that change the network can reset it."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.churn import ChurnReducer
-from sb3_cchain.tasks.sync import iterate_callbacks
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 
 
 def churn_reducers(callback: BaseCallback) -> list[ChurnReducer]:

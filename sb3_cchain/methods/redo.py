@@ -1,4 +1,4 @@
-"""Recycling dormant neurons."""
+"""ReDo: recycling dormant neurons."""
 
 from collections.abc import Callable
 from functools import partial

@@ -9,8 +9,8 @@ from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
-from sb3_cchain.tasks.sync import iterate_callbacks
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
 

@@ -4,8 +4,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.signal import is_continual
-from sb3_cchain.tasks.sync import TaskSync, iterate_callbacks
+from sb3_cchain.tasks.sync import TaskSync
 
 
 def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> list[BaseCallback]:

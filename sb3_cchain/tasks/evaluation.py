@@ -1,0 +1,50 @@
+"""Evaluation on the task being trained."""
+
+from collections.abc import Sequence
+
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
+from sb3_cchain.tasks.signal import is_continual
+
+
+def find_eval_envs(callback: BaseCallback | None) -> list[VecEnv]:
+    """
+    :param callback: All callbacks of ``learn()``
+    :return: The continual environments of every ``EvalCallback`` among them
+    """
+    return [
+        found.eval_env
+        for found in iterate_callbacks(callback)
+        if isinstance(found, EvalCallback) and is_continual(found.eval_env)
+    ]
+
+
+def evaluate_on(task_id: int, eval_envs: Sequence[VecEnv]) -> None:
+    """
+    :param task_id: The task being trained
+    :param eval_envs: Evaluation environments, which stay on that task from their next reset on
+    """
+    for eval_env in eval_envs:
+        eval_env.env_method("set_task", task_id)
+
+
+def check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:
+    """
+    :param env: The training environment
+    :param eval_env: An evaluation environment
+    :raises ValueError: When their tasks differ
+    """
+    tasks, eval_tasks = (an_env.get_attr("task_sequence", indices=0)[0] for an_env in (env, eval_env))
+    if tasks == eval_tasks:
+        return
+    if len(tasks) != len(eval_tasks):
+        difference = f"it has {len(eval_tasks)} tasks instead of {len(tasks)}"
+    else:
+        position = next(i for i, (task, eval_task) in enumerate(zip(tasks, eval_tasks, strict=True)) if task != eval_task)
+        difference = f"task {position} differs: {eval_tasks[position]} instead of {tasks[position]}"
+    raise ValueError(
+        f"The evaluation environment must have the tasks of the training environment, but {difference}. Make both with the "
+        "same arguments (RL Zoo: give them as --env-kwargs, or repeat those of the YAML file as --eval-env-kwargs)."
+    )
