@@ -72,7 +72,7 @@ SAME = CChainCallback()
 )
 def test_two_callbacks_are_refused(callbacks):
     model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS)
-    with pytest.raises(ValueError, match=r"`learn\(\)` was given 2 CChainCallbacks.*give it one"):
+    with pytest.raises(ValueError, match=r"`learn\(\)` was given 2 callbacks CChainCallback: give it one"):
         model.learn(32, callback=callbacks)
     assert model.num_timesteps == 0
 

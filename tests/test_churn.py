@@ -171,7 +171,7 @@ def test_churn_coef_is_read_as_ent_coef(value, initial, adaptive):
         ({"churn_coef": float("nan")}, r"`churn_coef` must be .* got nan"),
         ({"target_ratio": 0.0}, r"`target_churn_ratio` must be a number greater than 0, got 0.0"),
         ({"target_ratio": -1}, r"`target_churn_ratio` must be a number greater than 0, got -1"),
-        ({"target_ratio": "large"}, r"`target_churn_ratio` must be a number, \"auto\"; got 'large'"),
+        ({"target_ratio": "large"}, r"`target_churn_ratio` must be a number or \"auto\"; got 'large'"),
         ({"target_ratio": float("inf")}, r"`target_churn_ratio` must be .* got inf"),
         ({"warmup": -1}, r"`churn_warmup` must be an integer greater than or equal to 0, got -1"),
         ({"window": 0}, r"`churn_window` must be an integer greater than or equal to 1, got 0"),

@@ -19,7 +19,7 @@ def test_a_learn_in_which_nothing_is_learned_warns_once():
         assert len(caught) == 1
 
 
-@pytest.mark.parametrize("learning_rate", [1e-3, LinearSchedule(1e-3, 0.0, 1.0)])
+@pytest.mark.parametrize("learning_rate", [1e-3, 0.0, LinearSchedule(1e-3, 0.0, 1.0)])
 def test_a_learn_of_several_rollouts_does_not_warn(learning_rate):
     model = CChainPPO("MlpPolicy", RandomEnv(), learning_rate=learning_rate, **SETTINGS)
     with warnings.catch_warnings():

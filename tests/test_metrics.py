@@ -6,15 +6,17 @@ import sys
 import numpy as np
 import pytest
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
-from sb3_cchain.callbacks import read_returns
+from sb3_cchain.callbacks import TaskLearningStarts, read_returns
 from sb3_cchain.envs import RewardScale
+from sb3_cchain.methods import Oracle
 from tests.envs import CountEnv
+from tests.method_models import make_model
 
 SETTINGS = dict(n_steps=16, batch_size=8, device="cpu", seed=0)
 
@@ -235,3 +237,22 @@ def test_history_goes_on_over_several_calls_of_learn(tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("returns.csv"))
     model.save(tmp_path / "model")
     assert CChainPPO.load(tmp_path / "model", device="cpu").continual_returns == model.continual_returns
+
+
+@pytest.mark.parametrize("path", [3, 1.5, b"returns.csv", ["returns.csv"]])
+def test_a_path_that_is_none(path):
+    with pytest.raises(TypeError, match=r"`path` must be a path, got "):
+        ContinualMetrics(path)
+
+
+def test_a_path_that_is_a_folder(tmp_path):
+    with pytest.raises(ValueError, match=r"must be a file, but .* is a folder"):
+        make_model("PPO").learn(16, callback=[TaskSync(), ContinualMetrics(tmp_path)])
+
+
+@pytest.mark.parametrize("algorithm, cls", [("PPO", ContinualMetrics), ("PPO", Oracle), ("DQN", TaskLearningStarts)])
+def test_a_callback_that_is_given_twice(algorithm, cls):
+    model = make_model(algorithm)
+    with pytest.raises(ValueError, match=rf"`learn\(\)` was given 2 callbacks {cls.__name__}: give it one"):
+        model.learn(16, callback=[TaskSync(), cls(), CallbackList([cls()])])
+    assert model.num_timesteps == 0

@@ -9,7 +9,7 @@ from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
-from sb3_cchain.tasks.callback_tree import iterate_callbacks
+from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
@@ -97,12 +97,7 @@ class CChainCallback(FiniteCheck):
 
     def _on_training_start(self) -> None:
         self._check_parent()  # again: SB3 initialises the callbacks in a list before it tells them their parent
-        n_callbacks = sum(isinstance(callback, CChainCallback) for callback in iterate_callbacks(self.locals["callback"]))
-        if n_callbacks > 1:
-            raise ValueError(
-                f"`learn()` was given {n_callbacks} CChainCallbacks, which would add the churn loss {n_callbacks} times: "
-                "give it one"
-            )
+        require_single(self)  # two would add the churn loss twice
         # Tells this call of learn() from others
         self._start_time = self.model.start_time
 

@@ -96,7 +96,7 @@ class ChurnAlgorithm(BaseAlgorithm):
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
-        if self._is_first_training and self.lr_schedule(self._current_progress_remaining) == 0:
+        if self._is_first_training and self.lr_schedule(self._current_progress_remaining) == 0 < self.lr_schedule(1.0):
             warnings.warn(
                 "The learning rate is 0 from the first update of this `learn()` on, so nothing is learned. SB3's schedules go "
                 "to their end within each `learn()`: train for more than one rollout in a call, or use a constant rate."

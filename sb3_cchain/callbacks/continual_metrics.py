@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from numbers import Integral
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
+from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 
@@ -47,18 +49,21 @@ class ContinualMetrics(BaseCallback):
     :param path: The CSV file; by default ``returns.csv`` in the folder of the logs, if the model has ``tensorboard_log``
         or was given a logger by ``set_logger()``
     :raises ValueError: When training starts, if the file is not a file of returns, is damaged, or is being written by another
-        process
-    :raises TypeError: If the environment's ``info["task_id"]`` is not an integer
+        process, or if ``learn()`` was given a second ContinualMetrics
+    :raises TypeError: If ``path`` is not a path; during training, if the environment's ``info["task_id"]`` is not an integer
     """
 
     def __init__(self, path: str | Path | None = None):
         super().__init__()
+        if path is not None and not isinstance(path, (str, PathLike)):
+            raise TypeError(f"`path` must be a path, got {path!r}")
         self.path = None if path is None else Path(path)
         self._finished: dict[int, list[float]] = defaultdict(list)
         self._endless: dict[int, float] = {}
         self._file: ReturnsFile | None = None
 
     def _on_training_start(self) -> None:
+        require_single(self)
         add_overview(self.model)
         self._finished.clear()
         self._endless.clear()

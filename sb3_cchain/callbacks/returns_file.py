@@ -89,6 +89,8 @@ def _check_header(path: Path) -> bool:
     """Whether there are rows. Raises a ValueError when the file is not empty and not a file of returns."""
     if not path.exists():
         return False
+    if path.is_dir():
+        raise ValueError(f"`path` of ContinualMetrics must be a file, but {path} is a folder")
     with open(path, newline="", errors="replace") as file:
         header = file.readline(1000)
         if header.rstrip("\r\n").split(",") != list(COLUMNS) and header != "":

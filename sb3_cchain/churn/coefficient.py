@@ -163,7 +163,7 @@ def make_coefficient(
         (
             default_target_ratio
             if target_ratio == "auto"
-            else _number("target_churn_ratio", target_ratio, target_ratio, '"auto"')
+            else _number("target_churn_ratio", target_ratio, target_ratio, ' or "auto"')
         ),
         warmup=warmup,
         window=window,
@@ -177,7 +177,7 @@ def make_coefficient(
     return ChurnCoefficient(_number("churn_coef", churn_coef, churn_coef, _CHURN_COEF))
 
 
-_CHURN_COEF = '"auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
+_CHURN_COEF = ', "auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
 
 
 def _number(name: str, value: object, number: object, alternatives: str) -> float:
@@ -187,7 +187,7 @@ def _number(name: str, value: object, number: object, alternatives: str) -> floa
             raise TypeError
         return float(number)  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise ValueError(f"`{name}` must be a number, {alternatives}; got {value!r}") from None
+        raise ValueError(f"`{name}` must be a number{alternatives}; got {value!r}") from None
 
 
 def _check_factor(name: str, value: float, exclusive: bool = False) -> None:

@@ -4,6 +4,7 @@ from abc import abstractmethod
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks
 
 
@@ -25,6 +26,7 @@ class TaskBoundary(BaseCallback):
 
     def _on_training_start(self) -> None:
         require_tasks(self)
+        require_single(self)
         # Training that begins at step 0 begins with its first task, not with what the model was trained on before
         known = getattr(self.model, "trained_task_id", None) if self.num_timesteps > 0 else None
         self._switch = TaskSwitch(known)

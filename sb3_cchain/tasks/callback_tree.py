@@ -1,4 +1,4 @@
-"""The callbacks that a callback contains."""
+"""The callbacks that are given to ``learn()``, however they are nested."""
 
 from collections.abc import Iterator
 
@@ -22,3 +22,14 @@ def iterate_callbacks(callback: BaseCallback | None) -> Iterator[BaseCallback]:
         children += [callback.callback_on_new_best]
     for child in children:
         yield from iterate_callbacks(child)
+
+
+def require_single(callback: BaseCallback) -> None:
+    """
+    :param callback: A callback of which a training can have one, when training starts
+    :raises ValueError: When ``learn()`` was given several callbacks of its class
+    """
+    kind = type(callback)
+    n_callbacks = sum(isinstance(given, kind) for given in iterate_callbacks(callback.locals.get("callback")))
+    if n_callbacks > 1:
+        raise ValueError(f"`learn()` was given {n_callbacks} callbacks {kind.__name__}: give it one")
