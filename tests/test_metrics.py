@@ -1,5 +1,6 @@
 """Continual metrics: what is logged, what is written, that nothing scales it."""
 
+import os
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
 from sb3_cchain.callbacks import TaskLearningStarts, read_returns
+from sb3_cchain.callbacks.returns_file import ReturnsFile
 from sb3_cchain.envs import RewardScale
 from sb3_cchain.methods import Oracle
 from tests.envs import CountEnv
@@ -256,3 +258,22 @@ def test_a_callback_that_is_given_twice(algorithm, cls):
     with pytest.raises(ValueError, match=rf"`learn\(\)` was given 2 callbacks {cls.__name__}: give it one"):
         model.learn(16, callback=[TaskSync(), cls(), CallbackList([cls()])])
     assert model.num_timesteps == 0
+
+
+def test_a_file_is_locked_while_it_is_moved_aside(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    path, rename, moved = tmp_path / "returns.csv", os.rename, []
+    row = dict(timesteps=1, task_id=0, n_episodes=1, mean_return=0.0)
+    ReturnsFile(path, [row], keep_old=True).close()
+
+    def rename_locked(old, new):
+        with open(old) as other, pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        moved.append(new.name)
+        rename(old, new)
+
+    monkeypatch.setattr(os, "rename", rename_locked)
+    file = ReturnsFile(path, [], keep_old=True)
+    file.append([row])
+    file.close()
+    assert moved == ["returns.csv.1"] and read_returns(path) == read_returns(tmp_path / "returns.csv.1") == [row]

@@ -34,9 +34,10 @@ class ReturnsFile:
         has_rows = _check_header(path)
         self._file = _open_locked(path)
         if keep_old and has_rows:
-            self._file.close()
+            if fcntl is None:
+                self._file.close()  # Windows does not rename a file that is open
             os.rename(path, _free_name(path))
-            self._file = _open_locked(path)
+            self._file = _open_locked(path)  # closes the old file, whose lock has kept other processes away until now
         self._file.truncate(0)
         csv.DictWriter(self._file, COLUMNS).writeheader()
         self.append(rows)
