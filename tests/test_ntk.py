@@ -331,7 +331,7 @@ def test_bad_arguments(argument, value):
 
 
 def test_unknown_algorithms():
-    with pytest.raises(TypeError, match="on-policy algorithms, DQN and QRDQN, got SAC"):
+    with pytest.raises(TypeError, match="on-policy algorithms, DQN and QRDQN, without recurrent networks; got SAC"):
         SAC("MlpPolicy", "Pendulum-v1", device="cpu").learn(10, callback=NTKCallback())
 
 

@@ -23,6 +23,7 @@ from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.health import trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
+from sb3_cchain.analysis.ntk import has_ntk
 from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.replaced import replaced
@@ -133,8 +134,7 @@ def inspect_model(
 
 
 def _check_model(model: BaseAlgorithm) -> None:
-    is_known = isinstance(model, (OnPolicyAlgorithm, DQN)) or hasattr(model, "quantile_net")
-    if not is_known or hasattr(model, "_last_lstm_states"):
+    if not has_ntk(model):
         raise TypeError(
             "Models of on-policy algorithms without recurrent networks, DQN and QRDQN can be inspected, got one of "
             f"{type(model).__name__}. For others, give ChurnMonitor and NetworkHealth to learn()"

@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN, HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
@@ -13,6 +14,15 @@ from torch import nn
 from sb3_cchain.analysis.metrics.gradients import Objective, minibatch_gradients
 from sb3_cchain.analysis.metrics.ntk import gram_matrix
 from sb3_cchain.analysis.model_outputs import evaluation_mode
+
+
+def has_ntk(model: BaseAlgorithm) -> bool:
+    """
+    :param model: A model
+    :return: Whether its NTK can be computed: of on-policy algorithms without recurrent networks, DQN and QRDQN
+    """
+    is_known = isinstance(model, (OnPolicyAlgorithm, DQN)) or hasattr(model, "quantile_net")
+    return is_known and not hasattr(model, "_last_lstm_states")
 
 
 def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:

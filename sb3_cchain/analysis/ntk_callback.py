@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.metrics.ntk import ntk_statistics
-from sb3_cchain.analysis.ntk import policy_ntk, q_ntk
+from sb3_cchain.analysis.ntk import has_ntk, policy_ntk, q_ntk
 from sb3_cchain.analysis.plots import import_matplotlib, plot_ntk
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
@@ -87,10 +87,11 @@ class NTKCallback(TrainingInterval):
         self._n_matrices = 0
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, (OnPolicyAlgorithm, DQN)) and not hasattr(self.model, "quantile_net"):
-            raise TypeError(f"NTKCallback is for on-policy algorithms, DQN and QRDQN, got {type(self.model).__name__}")
-        if hasattr(self.model, "_last_lstm_states"):
-            raise TypeError(f"NTKCallback does not know recurrent networks, got {type(self.model).__name__}")
+        if not has_ntk(self.model):
+            raise TypeError(
+                "NTKCallback is for on-policy algorithms, DQN and QRDQN, without recurrent networks; got "
+                f"{type(self.model).__name__}"
+            )
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
