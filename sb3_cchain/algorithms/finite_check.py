@@ -46,7 +46,7 @@ class FiniteCheck(BaseCallback):
         name = f"Environment {index}{_id(self.training_env, index)}"
         raise ValueError(
             f"{name} gave a NaN or infinite {kind} at step {self.num_timesteps} of training: it holds {values[bad][0]}. "
-            "The network has not been trained on it. Mend the environment; SB3's VecCheckNan shows the action before."
+            "The network has not been trained on it. Fix the environment; SB3's VecCheckNan shows the action before."
         )
 
 

@@ -141,7 +141,7 @@ def _cause(replay_data: ReplayBufferSamples) -> str:
             wrong = tensor[~tensor.isfinite()]
             if len(wrong):
                 return (
-                    f"the {name} of the minibatch hold {wrong[0].item()}. Mend the environment, or clip what it returns; "
+                    f"the {name} of the minibatch hold {wrong[0].item()}. Fix the environment, or clip what it returns; "
                     "the replay buffer holds the faulty transition."
                 )
     return (

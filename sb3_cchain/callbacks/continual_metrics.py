@@ -44,7 +44,7 @@ class ContinualMetrics(BaseCallback):
     In an environment that is not continual the rewards are those before ``VecNormalize``. It is one task, and each further
     environment that ``set_env()`` gives, followed by ``learn(..., reset_num_timesteps=False)``, is the next one.
 
-    ``CChainPPO`` adds the callback by itself in a continual environment; give it to other algorithms.
+    ``CChainPPO`` and ``CChainDQN`` add the callback by themselves in a continual environment. Give it to other algorithms.
 
     :param path: The CSV file; by default ``returns.csv`` in the folder of the logs, if the model has ``tensorboard_log``
         or was given a logger by ``set_logger()``

@@ -175,10 +175,10 @@ class ChurnReducer(nn.Module):
 def _check_finite(loss: float, coef: float, greatest: float) -> None:
     if not math.isfinite(loss):
         problem = f"The churn loss is {loss}: the network's outputs, or the observations, hold NaN or infinite values."
-        mend = "Look for NaN or infinite rewards, lower the learning rate or `churn_coef`, or set `max_grad_norm`."
+        advice = "Look for NaN or infinite rewards, lower the learning rate or `churn_coef`, or set `max_grad_norm`."
     elif coef > greatest or not abs(coef * loss) <= greatest:
         problem = f"λ times the churn loss, {coef:.3g} * {loss:.3g}, is beyond the network's precision."
-        mend = "Look for huge rewards, or lower `target_churn_ratio` or `churn_coef`."
+        advice = "Look for huge rewards, or lower `target_churn_ratio` or `churn_coef`."
     else:
         return
-    raise ValueError(f"{problem} This update has not been made. {mend}")
+    raise ValueError(f"{problem} This update has not been made. {advice}")

@@ -17,15 +17,15 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     Tasks that arrive one after the other; the agent is not told.
 
     A task lasts for ``steps_per_task`` environment steps. The step that ends it truncates the episode, and the next
-    ``reset()`` begins the next task. The last task goes on for ever.
+    ``reset()`` begins the next task. The last task does not end.
 
     The agent sees neither the task nor the switch. For logging, ``info["task_id"]`` is the task that the step was made in,
     ``info["task_reward"]`` its reward and ``info["episode_return"]`` the return of the episode so far, before any wrapper
     touched the rewards.
 
     With several environments side by side steps are counted over all of them, so that they switch together:
-    :class:`~sb3_cchain.TaskSync` tells them their number (``CChainPPO`` does so by itself); without it, pass
-    ``n_envs``.
+    :class:`~sb3_cchain.TaskSync` tells them their number (``CChainPPO`` and ``CChainDQN`` add it by themselves); without it,
+    pass ``n_envs``.
 
     :param tasks: Environment ids, or callables that make an environment; they must agree in their spaces. A callable is
         given ``render_mode=...`` if and only if one is asked for.

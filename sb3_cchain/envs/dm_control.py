@@ -35,7 +35,7 @@ class FlatDMControl(gym.Wrapper):
         self._low, self._high = actions.low, actions.high
         shape = (spaces.flatdim(observations),)
         self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)
-        # Rounded to float32 a bound may lie outside of dm_control's own (0.8 of the quadruped does): clipping mends that
+        # Rounded to float32 a bound may lie outside of dm_control's own (0.8 of the quadruped does): clipping corrects that
         self.action_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32), dtype=np.float32)
         # Shimmy's `render_fps` is the length of a step in milliseconds, that of the environment made last
         fps = round(1 / env.unwrapped.dt)  # type: ignore[attr-defined]
@@ -131,6 +131,6 @@ def _check_task_names(domain: str, tasks: Sequence[str]) -> list[str]:
 
 
 def _make_task(domain: str, task: str, **kwargs: Any) -> gym.Env:
-    # By its specification, so that Gymnasium's checker, which would warn of the spaces that FlatDMControl mends, can be off
+    # By its specification, so that Gymnasium's checker, which would warn of the spaces that FlatDMControl replaces, can be off
     spec = gym.spec(f"dm_control/{domain}-{task}-v0")
     return FlatDMControl(gym.make(spec, disable_env_checker=True, **kwargs))

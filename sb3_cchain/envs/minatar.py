@@ -198,7 +198,7 @@ def _make_game(game: str, n_channels: int, **kwargs: Any) -> gym.Env:
     if env_id not in gym.registry:
         minatar.gym.register_envs()
     # By its specification, because Gymnasium warns that the id is out of date: "-v1" has only the actions that matter in the
-    # game. Gymnasium's checker would warn of the frames that PixelFrames mends.
+    # game. Gymnasium's checker would warn of the frames that PixelFrames replaces.
     env = gym.make(gym.spec(env_id), disable_env_checker=True, **kwargs)
     # SpaceInvaders' rewards are NumPy's integers, which Stable-Baselines3's checker refuses
     env = TransformReward(PixelFrames(SeededStickyAction(env)), float)

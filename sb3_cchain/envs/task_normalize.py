@@ -30,7 +30,7 @@ class TaskVecNormalize(VecNormalize):
     training (``EvalCallback`` copies them).
 
     Saved statistics belong to a task. When training is resumed with them, they go on if the environment is put on that task
-    (``CChainPPO`` and :class:`~sb3_cchain.TaskSync` do so) and restart otherwise.
+    (:class:`~sb3_cchain.TaskSync` does so) and restart otherwise.
 
     :param venv: The vectorised environment
     :param training: See ``VecNormalize``, as the following ones

@@ -9,7 +9,7 @@ from sb3_cchain.validation import check_number
 
 class TaskClock:
     """
-    Counts environment steps and says which task is due. The last task goes on for ever.
+    Counts environment steps and says which task is due. The last task does not end.
 
     The due task and the present one may differ: a task begins with an episode, so the present task stays until ``begin()``.
 
