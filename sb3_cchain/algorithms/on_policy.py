@@ -8,20 +8,29 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    MultiCategoricalDistribution,
+)
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, component_backward, extra_gradient
 from sb3_cchain.churn.component import COMPONENTS
-from sb3_cchain.churn.divergence import mean_absolute_change
+from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_absolute_change, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import (
-    DEFAULT_TARGET_RATIO,
     as_it_acts,
     has_training_mode,
-    policy_divergence,
     policy_outputs,
     policy_values,
 )
 from sb3_cchain.replaced import replaced
+
+# β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
+# of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
+DEFAULT_TARGET_RATIO: dict[Divergence, float] = {cross_entropy: 1e4, mean_squared_difference: 0.05}
 
 
 def make_policy_reducer(model: PPO, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
@@ -42,6 +51,24 @@ def make_policy_reducer(model: PPO, make_coefficient: Callable[[float], ChurnCoe
         partial(_outputs, model),  # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
         divergence,
         make_coefficient(DEFAULT_TARGET_RATIO[divergence]),
+    )
+
+
+def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
+    """
+    :param policy: An actor-critic policy
+    :return: Cross-entropy where actions are discrete, mean squared difference of the action means where they are Gaussian
+    :raises TypeError: For an action distribution that is neither
+    """
+    distribution = policy.action_dist
+    if isinstance(distribution, (CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)):
+        return cross_entropy
+    # StateDependentNoiseDistribution (gSDE) has no common base with it but is a Gaussian too
+    if isinstance(distribution, DiagGaussianDistribution) or policy.use_sde:
+        return mean_squared_difference
+    raise TypeError(
+        f"Churn reduction does not know the outputs of {type(distribution).__name__}. It supports categorical, "
+        "multi-categorical, Bernoulli, diagonal Gaussian and state-dependent (gSDE) action distributions."
     )
 
 

@@ -1,4 +1,4 @@
-"""The outputs of an SB3 actor-critic policy whose churn is measured, by kind of action distribution; how any policy acts."""
+"""The outputs of an SB3 actor-critic policy, by kind of action distribution; how any policy acts."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -8,7 +8,6 @@ import torch as th
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
-    DiagGaussianDistribution,
     Distribution,
     MultiCategoricalDistribution,
 )
@@ -18,12 +17,7 @@ from torch import nn
 from torch.distributions import Bernoulli, Categorical
 from torch.nn import functional as F
 
-from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_squared_difference
 from sb3_cchain.networks.compiled import uncompiled
-
-# β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
-# of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
-DEFAULT_TARGET_RATIO: dict[Divergence, float] = {cross_entropy: 1e4, mean_squared_difference: 0.05}
 
 # Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
 _MODE_FREE_PACKAGES = (
@@ -39,24 +33,6 @@ _MODE_FREE_PACKAGES = (
     "torch.nn.modules.pooling",
 )
 _MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
-
-
-def policy_divergence(policy: ActorCriticPolicy) -> Divergence:
-    """
-    :param policy: An actor-critic policy
-    :return: Cross-entropy where actions are discrete, mean squared difference of the action means where they are Gaussian
-    :raises TypeError: For an action distribution that is neither
-    """
-    distribution = policy.action_dist
-    if isinstance(distribution, (CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)):
-        return cross_entropy
-    # StateDependentNoiseDistribution (gSDE) has no common base with it but is a Gaussian too
-    if isinstance(distribution, DiagGaussianDistribution) or policy.use_sde:
-        return mean_squared_difference
-    raise TypeError(
-        f"Churn reduction does not know the outputs of {type(distribution).__name__}. It supports categorical, "
-        "multi-categorical, Bernoulli, diagonal Gaussian and state-dependent (gSDE) action distributions."
-    )
 
 
 def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
