@@ -1,5 +1,6 @@
 """C-CHAIN for a stock ``PPO``, for instance one that the stock ``rl_zoo3`` command trains."""
 
+from contextlib import ExitStack
 from functools import partial
 
 from stable_baselines3 import PPO
@@ -9,13 +10,11 @@ from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
+from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
-
-# Methods of the model that are replaced from the end of a rollout to train()
-REPLACED = ("train", "_excluded_save_params")
 
 
 class CChainCallback(FiniteCheck):
@@ -75,6 +74,8 @@ class CChainCallback(FiniteCheck):
         self.churn_component = churn_component
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
+        # The methods of the model that are replaced from the end of a rollout to train()
+        self._replaced = ExitStack()
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, PPO):
@@ -96,6 +97,7 @@ class CChainCallback(FiniteCheck):
             )
 
     def _on_training_start(self) -> None:
+        self._replaced.close()  # what training that was interrupted left, maybe on another model
         self._check_parent()  # again: SB3 initialises the callbacks in a list before it tells them their parent
         require_single(self)  # two would add the churn loss twice
         # Tells this call of learn() from others
@@ -110,10 +112,10 @@ class CChainCallback(FiniteCheck):
     def _on_rollout_end(self) -> None:
         if self.churn_reducer.coefficient.is_zero:
             return
-        train, not_saved = self.model.train, [*self.model._excluded_save_params(), *REPLACED]
+        train, not_saved = self.model.train, [*self.model._excluded_save_params(), "train", "_excluded_save_params"]
 
         def train_once() -> None:
-            self._on_training_end()  # first, so that it is gone when train() fails, too
+            self._replaced.close()  # first, so that this method is gone when train() fails, too
             if self.model.start_time != self._start_time:
                 # Left from a learn() that was interrupted between the end of a rollout and train()
                 train()
@@ -122,10 +124,9 @@ class CChainCallback(FiniteCheck):
                 train()
             self._state.n_updates = self.model._n_updates
 
-        self.model.train = train_once  # type: ignore[method-assign]
+        self._replaced.enter_context(replaced(self.model, "train", train_once))
         # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
-        self.model._excluded_save_params = lambda: not_saved  # type: ignore[method-assign]
+        self._replaced.enter_context(replaced(self.model, "_excluded_save_params", lambda: not_saved))
 
     def _on_training_end(self) -> None:
-        for name in REPLACED:
-            vars(self.model).pop(name, None)
+        self._replaced.close()
