@@ -9,7 +9,6 @@ folder for each run. The same command goes on where it was interrupted.
 
 import argparse
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -26,6 +25,7 @@ from benchmarks.grid.run import Run
 from benchmarks.grid.suites import SUITES
 from benchmarks.grid.training import PACKAGES
 from benchmarks.grid.view import duration
+from sb3_cchain.checkpoint import check_writable
 from sb3_cchain.methods.registry import METHOD_NAMES
 
 
@@ -76,7 +76,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         print_replaced(grid, args.results, console)
         backend = make_backend(args.address, args.cpus, args.gpus_per_run)
-        check_writable(args.results)
+        try:
+            check_writable(args.results)
+        except OSError as error:
+            parser.error(f"--results must be a folder that can be written to; got {args.results}: {error}")
     # An extra that is not installed, a folder or a cluster that is not there
     except (ValueError, ImportError, OSError, gym.error.Error) as error:
         parser.error(str(error))
@@ -133,18 +136,6 @@ def list_grid(grid: Sequence[Run], results: Path, console: Console) -> None:
     )
     print_replaced(grid, results, console)
     print_versions(grid, results, console)
-
-
-def check_writable(folder: Path) -> None:
-    """
-    :param folder: Folder of all results, which is made where it is missing
-    :raises ValueError: When nothing can be written there, which would otherwise come out when the first run has finished
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ValueError(f"--results must be a folder that can be written to; got {folder}: {error}") from error
 
 
 def print_replaced(grid: Sequence[Run], results: Path, console: Console) -> None:

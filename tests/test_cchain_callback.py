@@ -1,12 +1,116 @@
-"""CChainCallback: where it is refused, and what it leaves on the model."""
+"""CChainCallback trains a stock PPO as CChainPPO trains, and leaves nothing behind."""
+
+from copy import deepcopy
 
 import pytest
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+import torch as th
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cchain import CChainCallback
+from sb3_cchain import CChainCallback, CChainPPO
 from sb3_cchain.churn import ChurnReducer
+from tests.churn_models import PPO_SETTINGS as SETTINGS
+from tests.churn_models import assert_churn_was_reduced, assert_equal, differ
 from tests.envs import RandomEnv
+
+
+def test_callback_on_stock_ppo_equals_cchain_ppo():
+    arguments = dict(target_churn_ratio=1e3, churn_warmup=1, churn_window=3, churn_base_loss="surrogate")
+    cchain = CChainPPO("MlpPolicy", "CartPole-v1", **arguments, **SETTINGS).learn(4 * 32)
+    stock = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(4 * 32, callback=CChainCallback(**arguments))
+    assert_churn_was_reduced(stock)
+    assert_equal(cchain, stock)
+    assert "zero_grad" not in vars(stock.policy.optimizer)
+
+
+def test_a_model_saved_at_the_end_of_a_rollout_learns_when_it_is_loaded(tmp_path):
+    class Save(BaseCallback):
+        def _on_rollout_end(self):
+            self.model.save(tmp_path / "model")
+
+        def _on_step(self):
+            return True
+
+    PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=[CChainCallback(), Save()])
+    loaded = PPO.load(tmp_path / "model", env=make_vec_env("CartPole-v1"), device="cpu")
+    assert not {"train", "_excluded_save_params"} & set(vars(loaded))
+    before = deepcopy(loaded.policy.state_dict())
+    loaded.learn(64)
+    assert not th.equal(before["action_net.weight"], loaded.policy.action_net.weight)
+
+
+@pytest.mark.parametrize("another", [False, True])
+def test_another_call_of_learn_goes_on_with_the_history(another):
+    callback = CChainCallback()
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(2 * 32, callback=callback)
+    callback = CChainCallback() if another else callback
+    model.learn(2 * 32, callback=callback, reset_num_timesteps=False)
+    assert callback.churn_reducer.coefficient.n_seen == 4
+
+
+def test_training_without_the_callback_in_between_is_no_churn():
+    callback, references = CChainCallback(), []
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=callback)
+    for between in (lambda: None, lambda: model.learn(32)):
+        between()
+        callback.init_callback(model)
+        references.append(callback.churn_reducer.reference)
+    assert references[0] is not None and references[1] is None
+    assert callback.churn_reducer.coefficient.n_seen == 1
+
+
+SAME = CChainCallback()
+
+
+@pytest.mark.parametrize(
+    "callbacks",
+    [
+        [CChainCallback(), CChainCallback()],
+        [SAME, SAME],
+        [CallbackList([CChainCallback()]), CallbackList([CallbackList([CChainCallback()])])],
+    ],
+    ids=["two", "the same twice", "nested"],
+)
+def test_two_callbacks_are_refused(callbacks):
+    model = PPO("MlpPolicy", "CartPole-v1", **SETTINGS)
+    with pytest.raises(ValueError, match=r"`learn\(\)` was given 2 callbacks CChainCallback: give it one"):
+        model.learn(32, callback=callbacks)
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("argument", ["callback_after_eval", "callback_on_new_best"])
+def test_a_callback_held_by_another_is_refused(argument):
+    """It would be called at events alone, and reduce no churn."""
+    holder = EvalCallback(make_vec_env("CartPole-v1"), **{argument: CChainCallback()})
+    with pytest.raises(ValueError, match=r"EvalCallback holds it: give it to `learn\(\)`"):
+        PPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(32, callback=holder)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_interruption_before_the_update_leaves_nothing_that_reduces_churn(again):
+    class Interrupt(BaseCallback):
+        def _on_rollout_end(self):
+            raise KeyboardInterrupt
+
+        def _on_step(self):
+            return True
+
+    models = []
+    for callbacks in ([CChainCallback(), Interrupt()], [Interrupt()]):
+        models.append(PPO("MlpPolicy", "CartPole-v1", **SETTINGS))
+        with pytest.raises(KeyboardInterrupt):
+            models[-1].learn(32, callback=callbacks)
+        models[-1].learn(64, callback=CChainCallback() if again else None)
+        assert "train" not in vars(models[-1])
+    assert not differ(*models)
+
+
+def test_callback_refuses_other_algorithms():
+    with pytest.raises(TypeError, match="CChainCallback trains PPO, got A2C"):
+        A2C("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callback=CChainCallback())
+    with pytest.raises(TypeError, match="CChainPPO reduces churn by itself"):
+        CChainPPO("MlpPolicy", "CartPole-v1", **SETTINGS).learn(10, callback=CChainCallback())
 
 
 def make_model():

@@ -318,7 +318,9 @@ def test_an_empty_grid_is_an_error(capsys):
 
 
 def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("tempfile.TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError("Read-only file system")))
+    monkeypatch.setattr(
+        "sb3_cchain.checkpoint.files.TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError("Read-only file system"))
+    )
     with pytest.raises(SystemExit):
         main(["--suite", "gym_control", "--results", str(tmp_path / "new")])
     expected = f"--results must be a folder that can be written to; got {tmp_path / 'new'}: Read-only file system"

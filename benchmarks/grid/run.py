@@ -7,10 +7,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
+from sb3_cchain.zoo.settings import read_settings
 
 ROOT = Path(__file__).parents[2]
 
@@ -185,12 +184,10 @@ def shipped_hyperparameters(algo: str, env_id: str) -> dict[str, Any] | None:
     :param env_id: Environment id
     :return: What the shipped YAML file says about the environment, None where it says nothing
     """
-    return _read_yaml(ROOT / "zoo_hyperparams" / f"{algo}.yml").get(env_id)
+    return _read_settings(algo).get(env_id)
 
 
-@cache
-def _read_yaml(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text()) if path.exists() else {}
+_read_settings = cache(read_settings)
 
 
 def as_json(value: Any) -> Any:

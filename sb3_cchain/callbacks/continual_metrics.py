@@ -104,7 +104,8 @@ class ContinualMetrics(BaseCallback):
         task_id = step_task(self.model, infos)
         if self._switch.happened(task_id):
             self._state["n_switches"] += 1
-        if self._state["task_id"] != task_id:
+            self._begin_task(task_id)
+        elif self._state["task_id"] is None:
             self._begin_task(task_id)
         self._count_rewards(infos)
         if dones.any():
@@ -119,13 +120,12 @@ class ContinualMetrics(BaseCallback):
 
     def _count_rewards(self, infos: list[dict[str, Any]]) -> None:
         if "task_reward" in infos[0]:
-            rewards = np.array([info["task_reward"] for info in infos])
-        elif self._vec_normalize is not None:
-            rewards = self._vec_normalize.get_original_reward()
+            reward = sum(info["task_reward"] for info in infos)
         else:
-            rewards = self.locals["rewards"]
-        self._returns += rewards
-        reward = float(rewards.sum())
+            normalize = self._vec_normalize
+            rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
+            self._returns += rewards
+            reward = float(rewards.sum())
         self._state["reward"] += reward
         self._state["n_steps"] += len(infos)
         self._rollout_reward += reward

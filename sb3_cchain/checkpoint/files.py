@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
@@ -113,3 +114,16 @@ def load_statistics(normalize: VecNormalize, path: str | Path) -> None:
     for name in getattr(normalize, "statistics", {"obs_rms", "ret_rms"}):
         if name in vars(saved):
             setattr(normalize, name, vars(saved)[name])
+
+
+def check_writable(folder: Path) -> None:
+    """
+    Make a folder, and write to it.
+
+    :param folder: The folder
+    :raises OSError: When the folder cannot be made, or nothing can be written there
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryFile(dir=folder) as file:
+        file.write(bytes(4096))
+        file.flush()

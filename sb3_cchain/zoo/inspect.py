@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import gymnasium as gym
@@ -23,7 +22,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.analysis.inspection import algorithm_of, inspect_model, plot, report
-from sb3_cchain.checkpoint import check_model_file
+from sb3_cchain.checkpoint import check_model_file, check_writable
 from sb3_cchain.zoo.settings import read_saved
 
 
@@ -73,19 +72,6 @@ def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
         for name, algorithm in ALGOS.items()
         if (issubclass(algorithm, (OnPolicyAlgorithm, DQN)) or name == "qrdqn") and name != "ppo_lstm"
     }
-
-
-def check_writable(folder: Path) -> None:
-    """
-    Make a folder, and write to it.
-
-    :param folder: The folder
-    :raises OSError: When one of both is impossible
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryFile(dir=folder) as file:
-        file.write(bytes(4096))
-        file.flush()
 
 
 def load_as_trained(

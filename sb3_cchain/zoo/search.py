@@ -149,7 +149,7 @@ def add_to_callback(callbacks: str | list[Any], callback_class: type, arguments:
     for entry in entries:
         ((name, given),) = entry.items() if isinstance(entry, dict) else [(entry, {})]
         if issubclass(get_class_by_name(name), callback_class):
-            found, given = True, {**given, **arguments}
+            found, given = True, {**(given or {}), **arguments}
         with_arguments.append({name: given})
     if not found:
         raise ValueError(f"-optimize: `callback` must have {callback_class.__name__}, got {callbacks}")
