@@ -126,7 +126,7 @@ def test_output_that_cannot_be_written_to(tmp_path, monkeypatch, capsys):
     def full(*_, **__):
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(sb3_cchain.zoo.inspect, "TemporaryFile", full)
+    monkeypatch.setattr("sb3_cchain.checkpoint.files.TemporaryFile", full)
     line = error_of(capsys, tmp_path / "model.zip", "--output", tmp_path / "full")
     assert line == f"--output {tmp_path / 'full'}: No space left on device. {mend}"
 

@@ -28,9 +28,9 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     Deviation from the code released with the paper: the reference batch is drawn, and the old outputs are computed, before
     the update instead of by a copy of the network after it.
 
-    The defaults depend on no scale: λ adapts from the first updates on. The paper's values for MinAtar, ``"auto_50"``, a
-    warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other tasks a λ of 50 can be so
-    strong that nothing is learned.
+    The defaults do not depend on the scale of rewards: λ adapts from the first updates on. The paper's values for MinAtar,
+    ``"auto_50"``, a warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other tasks a λ
+    of 50 can be so strong that nothing is learned.
 
     :param args: Arguments of DoubleDQN
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at

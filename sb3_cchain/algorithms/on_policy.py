@@ -137,8 +137,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
     - ``churn/relative_loss``: λ·L_churn / \\|L\\|, which an adaptive λ holds near β
     - ``churn/policy_churn``: L_churn minus its value without any churn; for discrete actions the Kullback-Leibler
       divergence from the policy before an update to the one after it
-    - ``churn/value_churn``: mean absolute change of the state values by an update, the first of each epoch that another
-      follows
+    - ``churn/value_churn``: mean absolute change of the state values by the first update of each epoch, unless it is the
+      epoch's only one
 
     L is averaged over the updates.
 
