@@ -95,7 +95,7 @@ def inspect_model(
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
     elif isinstance(model, OffPolicyAlgorithm):
-        model.learning_starts = 0
+        model.learning_starts = model.num_timesteps  # the rollout that fills the buffer has no random actions
         model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         model.gradient_steps = n_updates
     # All episodes of this rollout, and no others
