@@ -12,6 +12,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -635,6 +636,13 @@ with LocalBackend(2, program=program) if address == "local" else RayBackend(addr
     runs = [Run("gym_control", "Continual/CartPole-v1", "cchain", seed, 2, 800, "smoke") for seed in range(4)]
     complete(runs, Path(results), Path(logs), backend)
 """
+
+
+def test_a_run_that_takes_no_time_has_a_rate(tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.grid.training.time", SimpleNamespace(monotonic=lambda: 5.0))
+    with LocalBackend(1, program=fake_program(tmp_path / "fake", {})) as backend:
+        assert complete([RUN], tmp_path / "results", tmp_path / "logs", backend, silent()) == []
+    assert find_result(RUN, tmp_path / "results").steps_per_second > 0
 
 
 @linux

@@ -136,7 +136,7 @@ class Training:
             git_commit=self._git_commit,
             started=self._started.isoformat(timespec="seconds"),
             finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            seconds=round(seconds, 1),
+            seconds=max(round(seconds, 1), 0.1),  # by which rates are divided
             peak_memory=self._memory,
         )
         returns = self._evaluations() if SUITES[run.suite].evaluates else self._training_returns()
