@@ -1,15 +1,20 @@
 """The clock that says which task is due, and the signal that it has switched."""
 
+import warnings
 from functools import partial
 
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cchain import CChainCallback, CChainPPO, ContinualMetrics
+from sb3_cchain import CChainCallback, CChainPPO, ContinualMetrics, TaskSync
+from sb3_cchain.callbacks import TaskLearningStarts
+from sb3_cchain.methods import Oracle
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.tasks.signal import TaskSwitch
 from tests.envs import CountEnv
+from tests.method_models import ALGORITHMS, make_env, make_model
 
 SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=1, device="cpu", seed=0)
 
@@ -94,3 +99,33 @@ def test_an_environment_that_comes_again_is_a_new_task():
         model.set_env(world)
         model.learn(16, callback=metrics, reset_num_timesteps=False)
     assert list(dict.fromkeys(row["task_id"] for row in metrics.rows)) == [0, 1, 2]
+
+
+FOLLOWERS = pytest.mark.parametrize(
+    "algorithm, cls", [("PPO", ContinualMetrics), ("PPO", Oracle), ("DQN", TaskLearningStarts)]
+)
+
+
+@FOLLOWERS
+def test_environments_side_by_side_without_task_sync_are_warned_of(algorithm, cls):
+    envs = make_vec_env(make_env, 2)
+    with pytest.warns(UserWarning, match=r"count 1 environment\(s\) side by side, but there are 2.*TaskSync"):
+        make_model(algorithm, envs).learn(32, callback=cls())
+
+
+@FOLLOWERS
+def test_training_that_goes_on_without_task_sync_is_warned_of(tmp_path, algorithm, cls):
+    make_model(algorithm).learn(40, callback=TaskSync()).save(tmp_path / "model")
+    model = ALGORITHMS[algorithm].func.load(tmp_path / "model", env=make_env(), device="cpu")
+    with pytest.warns(UserWarning, match=r"are at step 0, but training is at step 4\d.*TaskSync"):
+        model.learn(16, callback=cls(), reset_num_timesteps=False)
+
+
+@FOLLOWERS
+@pytest.mark.parametrize("n_envs, with_sync", [(1, False), (2, True)])
+def test_environments_that_know_the_time_are_not_warned_of(algorithm, cls, n_envs, with_sync):
+    model = make_model(algorithm, make_vec_env(make_env, n_envs))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The continual environments")
+        for reset in (True, False):
+            model.learn(32, callback=[cls(), *([TaskSync()] if with_sync else [])], reset_num_timesteps=reset)

@@ -14,6 +14,7 @@ from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
+from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 
 
@@ -64,6 +65,7 @@ class ContinualMetrics(BaseCallback):
 
     def _on_training_start(self) -> None:
         require_single(self)
+        warn_without_sync(self)
         add_overview(self.model)
         self._finished.clear()
         self._endless.clear()

@@ -7,6 +7,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks, step_task
+from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.validation import check_number
 
 
@@ -40,6 +41,7 @@ class TaskLearningStarts(BaseCallback):
     def _on_training_start(self) -> None:
         require_tasks(self)
         require_single(self)
+        warn_without_sync(self)
         if self.num_timesteps == 0:
             self.model.learning_starts = self.learning_starts
             self.model.learning_starts_task_id = None  # type: ignore[attr-defined]

@@ -6,6 +6,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks
+from sb3_cchain.tasks.sync import warn_without_sync
 
 
 class TaskBoundary(BaseCallback):
@@ -27,6 +28,7 @@ class TaskBoundary(BaseCallback):
     def _on_training_start(self) -> None:
         require_tasks(self)
         require_single(self)
+        warn_without_sync(self)
         # Training that begins at step 0 begins with its first task, not with what the model was trained on before
         known = getattr(self.model, "trained_task_id", None) if self.num_timesteps > 0 else None
         self._switch = TaskSwitch(known)

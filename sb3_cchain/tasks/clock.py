@@ -36,6 +36,11 @@ class TaskClock:
         return bisect_right(self._ends, self._total_steps) if self._pinned_task is None else self._pinned_task
 
     @property
+    def n_steps(self) -> int:
+        """Environment steps made since the first task began, over all environments."""
+        return self._total_steps - self._first_step
+
+    @property
     def is_over(self) -> bool:
         """Whether the present task's time is over. It never is when the clock is pinned to a task."""
         return self._pinned_task is None and self.due_task != self.task_id

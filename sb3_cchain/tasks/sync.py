@@ -1,11 +1,14 @@
 """Keeps continual environments in step with training."""
 
+import warnings
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.evaluation import check_same_tasks, evaluate_on, find_eval_envs
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_continual, step_task
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, is_continual, require_continual, step_task
 
 
 class TaskSync(BaseCallback):
@@ -47,6 +50,26 @@ class TaskSync(BaseCallback):
         if self._switch.happened(task_id):
             evaluate_on(task_id, self._eval_envs)
         return True
+
+
+def warn_without_sync(callback: BaseCallback) -> None:
+    """
+    Warn when continual environments do not know the time of the training, and no :class:`TaskSync` tells them.
+
+    :param callback: A callback that follows the tasks, when training starts
+    """
+    env = callback.training_env
+    given = iterate_callbacks(callback.locals.get("callback"))
+    if not is_continual(env) or any(isinstance(other, TaskSync) for other in given):
+        return
+    clock = env.get_attr("clock", indices=0)[0]
+    if clock.n_envs != env.num_envs:
+        problem = f"count {clock.n_envs} environment(s) side by side, but there are {env.num_envs}: they switch at other times"
+    elif callback.num_timesteps not in (0, clock.n_steps):
+        problem = f"are at step {clock.n_steps}, but training is at step {callback.num_timesteps}: they may be in another task"
+    else:
+        return
+    warnings.warn(f"The continual environments {problem}. Give `learn()` a TaskSync, before the other callbacks.")
 
 
 def _check_side_by_side(env: VecEnv) -> None:
