@@ -579,3 +579,20 @@ def test_in_a_process_of_its_own():
     for actions in random_actions(30, size=(1,)):
         assert np.array_equal(own.step(actions)[0], other.step(actions)[0])
     other.close()
+
+
+UNCLOSED = """
+import gc
+from sb3_cchain.envs import ProcgenGame
+
+gc.set_threshold(1)
+for seed in range(20):
+    game = ProcgenGame("starpilot")
+    game.itself = game  # for the garbage collector alone
+    game.reset(seed=seed)
+    game.step(0)
+"""
+
+
+def test_games_that_nobody_closes_do_not_stop_others():
+    subprocess.run([sys.executable, "-c", UNCLOSED], check=True, timeout=120)

@@ -1,5 +1,6 @@
 """Continual ProcGen: a chain of levels of one game."""
 
+import gc
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -124,7 +125,18 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         :param kwargs: Further arguments of ``ProcgenGym3Env``
         :return: Procgen itself, with this game's settings; to be closed by the caller
         """
-        return _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
+        # cffi looks up the functions of procgen under a lock that one thread cannot take twice. If the garbage collector ran
+        # then and closed a game that nobody had closed, this would wait for ever. So it does not run while a game is made, and
+        # the function that closes the game is looked up now.
+        enabled = gc.isenabled()
+        gc.disable()
+        try:
+            game = _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
+            _ = game._c_lib.libenv_close
+        finally:
+            if enabled:
+                gc.enable()
+        return game
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
