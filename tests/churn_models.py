@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from torch import nn
 
@@ -80,6 +80,25 @@ class NormalisedExtractor(BaseFeaturesExtractor):
         return nn.functional.dropout(self.net(observations), training=self.training)
 
 
+class DoubleFlattenExtractor(FlattenExtractor):
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+class DoubleCombinedExtractor(CombinedExtractor):
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+def learn_in_double_precision(make, n_timesteps, env="CartPole-v1", policy="MlpPolicy", policy_kwargs=None, **arguments):
+    """The churn loss is a difference of nearly equal numbers: in single precision its rounding errors soon show."""
+    extractor = DoubleCombinedExtractor if policy == "MultiInputPolicy" else DoubleFlattenExtractor
+    arguments["policy_kwargs"] = {"net_arch": [16], **(policy_kwargs or {}), "features_extractor_class": extractor}
+    model = make(policy, env, **arguments)
+    model.policy.double()
+    return model.learn(n_timesteps)
+
+
 def churn_keys(model):
     own_keys = {form.algorithm: form.own_key for form in FORMS.values()}
     return {"churn/loss", "churn/coef", "churn/relative_loss", "churn/value_churn", own_keys[type(model)]}
@@ -106,6 +125,12 @@ def assert_equal(model, other):
     states = [getattr(each, "churn_state", None) for each in (model, other)]
     if all(isinstance(state, ChurnState) for state in states):
         assert states[0].reducer.coefficient.value == states[1].reducer.coefficient.value
+
+
+def assert_close(model, other, atol):
+    """Their policies."""
+    for name, tensor in model.policy.state_dict().items():
+        assert th.allclose(tensor, other.policy.state_dict()[name], rtol=0, atol=atol), name
 
 
 def state_of(model):

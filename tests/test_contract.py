@@ -8,22 +8,15 @@ from functools import cache, partial
 import pytest
 import torch as th
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.algorithms import dqn_cchain
+from sb3_cchain.algorithms import dqn_cchain, on_policy
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import policy_outputs
-from tests.churn_models import assert_equal, differ
+from tests.churn_models import assert_close, assert_equal, differ, learn_in_double_precision
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
-
-
-def assert_close(model, other, atol):
-    for name, tensor in model.policy.state_dict().items():
-        assert th.allclose(tensor, other.policy.state_dict()[name], rtol=0, atol=atol), name
-
 
 # --- PPO -------------------------------------------------------------------------------------------------------------------
 
@@ -47,6 +40,8 @@ class WrittenOutPPO(PPO):
     )
     pending = None
     n_optimizer_steps = 0
+    churn_reference = "independent"
+    churn_batch_size = 1
 
     def churn_term(self):
         if self.pending is None:
@@ -56,16 +51,28 @@ class WrittenOutPPO(PPO):
         return COEF * divergence(old, policy_outputs(self.policy, reference))
 
     def remember(self, minibatches, position):
-        reference = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)].observations
+        first = position + (1 if self.churn_reference == "next" else (len(minibatches) + 1) // 2)
+        following = [minibatches[(first + i) % len(minibatches)].observations for i in range(2)]
+        reference = th.cat(following)[: round(self.churn_batch_size * self.batch_size)]
         with th.no_grad():
             self.pending = reference, policy_outputs(self.policy, reference)
         self.n_optimizer_steps += 1
 
 
+def written_out_ppo(churn_reference, churn_batch_size):
+    class WithReferences(WrittenOutPPO):
+        pass
+
+    WithReferences.churn_reference = churn_reference
+    WithReferences.churn_batch_size = churn_batch_size
+    return WithReferences
+
+
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.parametrize("max_grad_norm", [0.5, 0.05])
 @pytest.mark.parametrize("target_kl", [None, 0.0005])
-def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl):
+def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl, monkeypatch):
+    monkeypatch.setattr(on_policy, "can_evaluate_jointly", lambda policy: False)
     settings = dict(PPO_SETTINGS, max_grad_norm=max_grad_norm, target_kl=target_kl)
     written_out = WrittenOutPPO("MlpPolicy", env_id, **settings).learn(64 * N_ITERATIONS)
     seam = CChainPPO("MlpPolicy", env_id, churn_coef=COEF, **settings).learn(64 * N_ITERATIONS)
@@ -76,6 +83,23 @@ def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, 
     assert stopped_early == (target_kl is not None)
     assert_equal(seam, written_out)
     assert differ(seam, plain)  # the term makes a difference
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize("target_kl", [None, 0.0005])
+@pytest.mark.parametrize("churn_reference", ["independent", "next"])
+@pytest.mark.parametrize("churn_batch_size", [0.5, 1, 2])
+def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, target_kl, churn_reference, churn_batch_size):
+    settings = dict(PPO_SETTINGS, target_kl=target_kl)
+    written_out, seam = (
+        learn_in_double_precision(make, 64 * N_ITERATIONS, env_id, **settings)
+        for make in (
+            written_out_ppo(churn_reference, churn_batch_size),
+            partial(CChainPPO, churn_coef=COEF, churn_reference=churn_reference, churn_batch_size=churn_batch_size),
+        )
+    )
+    assert written_out.n_optimizer_steps >= 100, written_out.n_optimizer_steps
+    assert_close(seam, written_out, atol=1e-12)
 
 
 @pytest.mark.parametrize("env_id, target_churn_ratio", [("CartPole-v1", 1e4), ("Pendulum-v1", 0.05)])
@@ -156,20 +180,6 @@ def test_double_dqn_equals_sb3_source_with_other_targets_and_loss(double_q, loss
     assert_equal(model, written_out)
     assert model.logger.name_to_value["train/loss"] == written_out.logger.name_to_value["train/loss"]
     assert differ(model, without_churn_reduction(DQN, n_steps=n_steps))
-
-
-class DoublePrecision(FlattenExtractor):
-    """The churn loss is a difference of nearly equal numbers: in single precision its rounding errors soon show."""
-
-    def forward(self, observations):
-        return super().forward(observations).double()
-
-
-def learn_in_double_precision(make, n_steps, env_id="CartPole-v1", **arguments):
-    arguments["policy_kwargs"] = dict(net_arch=[16], features_extractor_class=DoublePrecision)
-    model = make("MlpPolicy", env_id, **arguments)
-    model.policy.double()
-    return model.learn(n_steps)
 
 
 @pytest.mark.parametrize("own_pass", [False, True])

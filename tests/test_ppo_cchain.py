@@ -1,6 +1,5 @@
 """CChainPPO: what is special about churn reduction of PPO's policy."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -89,16 +88,15 @@ def test_policy_churn_is_the_kl_divergence():
     )
     pairs = []
 
-    def backward(reference, add_gradient, backward=model.churn_reducer.backward):
+    def loss(new_outputs, loss=model.churn_reducer.loss):
         reducer = model.churn_reducer
-        if reducer.reference is not None:
-            with th.no_grad():
-                new = model.policy.get_distribution(reducer.reference).distribution
-            old = th.distributions.Categorical(probs=reducer.old_outputs)
-            pairs.append(th.distributions.kl_divergence(old, new).mean().item())
-        backward(reference, add_gradient)
+        with th.no_grad():
+            new = model.policy.get_distribution(reducer.reference).distribution
+        old = th.distributions.Categorical(probs=reducer.old_outputs)
+        pairs.append(th.distributions.kl_divergence(old, new).mean().item())
+        return loss(new_outputs)
 
-    model.churn_reducer.backward = backward
+    model.churn_reducer.loss = loss
     model.learn(2 * 32)
     assert model.logger.name_to_value["churn/policy_churn"] == pytest.approx(np.mean(pairs[-2:]), abs=1e-6)
 
@@ -155,58 +153,6 @@ def test_a_policy_with_a_distribution_of_its_own():
     observations = th.randn(5, 4)
     acting = model.policy.get_distribution(observations).distribution.probs
     assert th.allclose(policy_outputs(model.policy, observations), acting)
-
-
-class IndexEnv(gym.Env):
-    """The observation is the number of steps made, so that a sample can be told from the others."""
-
-    observation_space = spaces.Box(0, np.inf, (1,))
-    action_space = spaces.Discrete(2)
-
-    def __init__(self):
-        self.n = 0
-
-    def reset(self, *, seed=None, options=None):
-        return np.array([self.n], dtype=np.float32), {}
-
-    def step(self, action):
-        self.n += 1
-        return np.array([self.n], dtype=np.float32), 0.0, False, False, {}
-
-
-class RecordingPPO(CChainPPO):
-    """Records which samples each update was made on, and on which its churn was measured."""
-
-    def _setup_model(self):
-        super()._setup_model()
-        self.trained_on, self.measured_on = [], []
-        evaluate_actions, backward = self.policy.evaluate_actions, self.churn_reducer.backward
-
-        def recording_evaluate_actions(observations, actions):
-            self.trained_on.append({int(x) for x in observations})
-            return evaluate_actions(observations, actions)
-
-        def recording_backward(reference, *args):
-            self.measured_on.append({int(x) for x in reference})
-            return backward(reference, *args)
-
-        self.policy.evaluate_actions = recording_evaluate_actions
-        self.churn_reducer.backward = recording_backward
-
-
-@pytest.mark.parametrize("n_steps, batch_size", [(64, 16), (64, 32), (60, 20), (70, 32), (64, 8)])
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
-def test_reference_batch_shares_nothing_with_the_minibatch(n_steps, batch_size):
-    model = RecordingPPO("MlpPolicy", IndexEnv(), n_steps=n_steps, batch_size=batch_size, n_epochs=3, seed=0, device="cpu")
-    model.learn(2 * n_steps)
-    n_minibatches = -(-n_steps // batch_size)
-    assert len(model.trained_on) == len(model.measured_on) == 2 * 3 * n_minibatches
-    for trained_on, measured_on in zip(model.trained_on, model.measured_on, strict=True):
-        assert not trained_on & measured_on
-    # Over an epoch, each sample serves once
-    for epoch in range(6):
-        measured = model.measured_on[epoch * n_minibatches : (epoch + 1) * n_minibatches]
-        assert len(set.union(*measured)) == sum(map(len, measured)) == n_steps
 
 
 @pytest.mark.filterwarnings("error")

@@ -8,8 +8,9 @@ from stable_baselines3.common.callbacks import EventCallback
 
 from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.finite_check import FiniteCheck
-from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
+from sb3_cchain.algorithms.on_policy import PolicyChurnOptions, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import make_coefficient
+from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
@@ -40,6 +41,9 @@ class CChainCallback(FiniteCheck):
     :param reset_churn_coef: As for ``CChainPPO``
     :param churn_base_loss: As for ``CChainPPO``
     :param churn_component: As for ``CChainPPO``
+    :param churn_reference: As for ``CChainPPO``
+    :param churn_batch_size: As for ``CChainPPO``
+    :param lean_distributions: As for ``CChainPPO``. The model keeps them.
     :raises ValueError: Naming the argument that is out of its range; when training starts, for a second CChainCallback in the
         same ``learn()``, and for one that another callback holds
     :raises TypeError: When ``reset_churn_coef`` is not a boolean; when training starts, for a model that is not a stock PPO
@@ -57,6 +61,9 @@ class CChainCallback(FiniteCheck):
         reset_churn_coef: bool = False,
         churn_base_loss: str = "actor",
         churn_component: str = "full",
+        churn_reference: str = "independent",
+        churn_batch_size: float = 1.0,
+        lean_distributions: bool = True,
     ):
         super().__init__()
         self._make_coefficient = partial(
@@ -69,9 +76,9 @@ class CChainCallback(FiniteCheck):
         )
         self._make_coefficient(default_target_ratio=1.0)  # raise on bad values now
         check_bool("reset_churn_coef", reset_churn_coef)
-        check_choices(churn_base_loss, churn_component)
-        self.churn_base_loss = churn_base_loss
-        self.churn_component = churn_component
+        check_bool("lean_distributions", lean_distributions)
+        self._options = PolicyChurnOptions(churn_base_loss, churn_component, churn_reference, churn_batch_size)
+        self.lean_distributions = lean_distributions
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
         # The methods of the model that are replaced from the end of a rollout to train()
@@ -84,6 +91,8 @@ class CChainCallback(FiniteCheck):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
         self._check_parent()
         add_overview(self.model)
+        if self.lean_distributions:
+            make_lean(self.model)
         self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
         past, n_updates = vars(self.model).get("churn_state"), self.model._n_updates
         self._state = keep_churn_state(self.model, self.churn_reducer, self._task_switch, past, n_updates)
@@ -120,7 +129,7 @@ class CChainCallback(FiniteCheck):
                 # Left from a learn() that was interrupted between the end of a rollout and train()
                 train()
                 return
-            with reduced_churn(self.model, self.churn_reducer, self.churn_base_loss, self.churn_component):
+            with reduced_churn(self.model, self.churn_reducer, self._options):
                 train()
             self._state.n_updates = self.model._n_updates
 

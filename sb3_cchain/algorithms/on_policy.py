@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -17,9 +17,13 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, component_backward, extra_gradient
+from sb3_cchain.algorithms.reference_batches import REFERENCES, ReferenceBatches
+from sb3_cchain.algorithms.reference_passes import joint_passes, separate_passes
+from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient
 from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_absolute_change, mean_squared_difference
+from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
 from sb3_cchain.networks.policy_outputs import (
     as_it_acts,
     has_training_mode,
@@ -27,6 +31,7 @@ from sb3_cchain.networks.policy_outputs import (
     policy_values,
 )
 from sb3_cchain.replaced import replaced
+from sb3_cchain.validation import check_number
 
 # β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
 # of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
@@ -76,57 +81,41 @@ def _outputs(model: PPO, observations: PyTorchObs) -> th.Tensor:
     return policy_outputs(model.policy, observations)
 
 
-class ReferenceBatches:
-    """
-    Stands in for ``rollout_buffer.get`` and pairs each minibatch of an epoch with another one as its reference batch.
-
-    The minibatches of an epoch are a random partition of the rollout. Any other minibatch is therefore a random sample that
-    shares nothing with this one (the paper's B_ref ∩ B_train = ∅), and SB3 gathers it anyway. The one half an epoch away is
-    taken. An epoch of a single minibatch has no other data: the minibatch is its own reference batch.
-
-    :param get: The rollout buffer's ``get(batch_size)``
-    """
-
-    # The reference batch of the minibatch that is being trained on, and whether that is the first of its epoch
-    current: PyTorchObs
-    starts_epoch: bool
-
-    def __init__(self, get: Callable[..., Iterator[Any]]):
-        self._get = get
-
-    def get(self, batch_size: int | None = None) -> Iterator[Any]:
-        """
-        :param batch_size: Minibatch size
-        :return: The minibatches of one epoch
-        """
-        minibatches = list(self._get(batch_size))
-        distance = (len(minibatches) + 1) // 2
-        for position, minibatch in enumerate(minibatches):
-            self.current = minibatches[(position + distance) % len(minibatches)].observations
-            self.starts_epoch = position == 0
-            yield minibatch
-
-
 # L, by the name in `churn_base_loss`
 BASE_LOSSES = ("actor", "surrogate")
 
 
-def check_choices(churn_base_loss: str, churn_component: str) -> None:
+@dataclass(frozen=True)
+class PolicyChurnOptions:
     """
-    :param churn_base_loss: The argument
-    :param churn_component: The argument
-    :raises ValueError: When one of them is not among the allowed values
+    How the churn of a PPO policy is measured and reduced. The names are those of the arguments.
+
+    :param churn_base_loss: What L is: ``"actor"`` for the clipped surrogate and the entropy bonus, ``"surrogate"`` for the
+        clipped surrogate alone
+    :param churn_component: Which component of the churn gradient is used: ``"full"``, ``"projection"`` or ``"orthogonal"``
+    :param churn_reference: Where reference batches are taken from: ``"independent"`` or ``"next"``
+    :param churn_batch_size: Size of a reference batch in minibatches
+    :raises ValueError: Naming the argument that is not allowed
     """
-    for name, value, allowed in (
-        ("churn_base_loss", churn_base_loss, BASE_LOSSES),
-        ("churn_component", churn_component, COMPONENTS),
-    ):
-        if value not in allowed:
-            raise ValueError(f"`{name}` must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+
+    churn_base_loss: str = "actor"
+    churn_component: str = "full"
+    churn_reference: str = "independent"
+    churn_batch_size: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("churn_base_loss", BASE_LOSSES),
+            ("churn_component", COMPONENTS),
+            ("churn_reference", REFERENCES),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"`{name}` must be one of {', '.join(map(repr, allowed))}, got {getattr(self, name)!r}")
+        check_number("churn_batch_size", self.churn_batch_size, minimum=0, exclusive=True)
 
 
 @contextmanager
-def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", component: str = "full") -> Iterator[None]:
+def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions) -> Iterator[None]:
     """
     Run ``model``'s own ``train()`` in this block to train it with churn reduction.
 
@@ -144,39 +133,40 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, base_loss: str = "actor", c
 
     :param model: A PPO model
     :param reducer: Its churn reducer
-    :param base_loss: What L is: ``"actor"`` for the clipped surrogate and the entropy bonus, ``"surrogate"`` for the clipped
-        surrogate alone
-    :param component: Which component of the churn gradient is used: ``"full"``, ``"projection"`` or ``"orthogonal"``
+    :param options: How churn is measured and reduced
     """
-    policy, rollout_buffer = model.policy, model.rollout_buffer
-    references = ReferenceBatches(rollout_buffer.get)
-    acting = (lambda: as_it_acts(policy)) if has_training_mode(policy) else nullcontext
+    policy, rollout_buffer = uncompiled(model.policy), model.rollout_buffer
+    references = ReferenceBatches(rollout_buffer, options.churn_reference, options.churn_batch_size)
     reducer.discard_losses()  # of an iteration that was interrupted
     coef = reducer.coefficient.value
+    acting = (lambda: as_it_acts(policy)) if has_training_mode(policy) else nullcontext
     old_values: th.Tensor | None = None
     value_churns: list[float] = []
 
-    def backward(add_gradient: Callable[[th.Tensor], Any]) -> None:
+    def before_update(add_gradient: Callable[[], None]) -> None:
         nonlocal old_values
         with acting():
             if old_values is not None:
                 assert reducer.reference is not None
                 value_churns.append(mean_absolute_change(old_values, policy_values(policy, reducer.reference)))
-            reducer.backward(references.current, add_gradient)
+            add_gradient()
             old_values = policy_values(policy, references.current) if references.starts_epoch else None
 
-    full = component == "full"
+    if options.churn_component == "full" and can_evaluate_jointly(policy):
+        passes = joint_passes(policy, reducer, references)
+    else:
+        passes = separate_passes(policy, reducer, references, options.churn_component)
     with (
-        nullcontext(th.Tensor.backward) if full else component_backward(list(policy.parameters()), component) as add_gradient,
         replaced(rollout_buffer, "get", references.get),
-        extra_gradient(policy.optimizer, lambda: backward(add_gradient)),
+        passes as add_gradient,
+        extra_gradient(policy.optimizer, lambda: before_update(add_gradient)),
     ):
         yield
 
     if reducer.losses:
         logged = model.logger.name_to_value
         loss = logged["train/policy_gradient_loss"]
-        if base_loss == "actor":
+        if options.churn_base_loss == "actor":
             loss += model.ent_coef * logged["train/entropy_loss"]
         churn_loss = np.mean(reducer.losses)
         model.logger.record("churn/loss", churn_loss)

@@ -6,8 +6,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.algorithms.on_policy import check_choices, make_policy_reducer, reduced_churn
+from sb3_cchain.algorithms.on_policy import PolicyChurnOptions, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.networks.lean_distributions import make_lean
+from sb3_cchain.validation import check_bool
 
 SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
 
@@ -48,19 +50,46 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param churn_component: Which component of the churn gradient is used: ``"full"``, or, as the paper's ablation does
         (Section 5.2), only its ``"projection"`` on PPO's gradient of the actor's parameters or the ``"orthogonal"`` rest.
         It is added before the gradient is clipped.
+    :param churn_reference: Where reference batches are taken from, always outside the minibatch whose update they measure:
+        ``"independent"`` for other random samples of the rollout, ``"next"`` for the minibatch that is trained on next, which
+        costs less because its outputs are needed anyway
+    :param churn_batch_size: Size of a reference batch in minibatches: 2, 4 or 8 in the paper's Appendix A.1
+    :param lean_distributions: Whether the policy's action distribution is made without the checks of torch's, which cost more
+        time than a small network: see :func:`~sb3_cchain.make_lean`. The results are the same, to the bit.
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range; during training, for NaN or infinite rewards,
         observations and churn losses, before an update is made with them
     """
 
-    def __init__(self, *args: Any, churn_base_loss: str = "actor", churn_component: str = "full", **kwargs: Any):
-        check_choices(churn_base_loss, churn_component)
+    def __init__(
+        self,
+        *args: Any,
+        churn_base_loss: str = "actor",
+        churn_component: str = "full",
+        churn_reference: str = "independent",
+        churn_batch_size: float = 1.0,
+        lean_distributions: bool = True,
+        **kwargs: Any,
+    ):
         self.churn_base_loss = churn_base_loss
         self.churn_component = churn_component
+        self.churn_reference = churn_reference
+        self.churn_batch_size = churn_batch_size
+        self.lean_distributions = lean_distributions
+        check_bool("lean_distributions", lean_distributions)
+        self._churn_options()
         super().__init__(*args, **kwargs)
 
+    def _churn_options(self) -> PolicyChurnOptions:
+        return PolicyChurnOptions(self.churn_base_loss, self.churn_component, self.churn_reference, self.churn_batch_size)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.lean_distributions:
+            make_lean(self)
+
     def _make_churn_reducer(self) -> ChurnReducer:
-        check_choices(self.churn_base_loss, self.churn_component)  # load() does not give them to __init__()
+        self._churn_options()  # load() does not give them to __init__()
         return make_policy_reducer(self, self._make_churn_coefficient)
 
     def train(self) -> None:
@@ -68,7 +97,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
         if self.churn_reducer.coefficient.is_zero:
             super().train()
         else:
-            with reduced_churn(self, self.churn_reducer, self.churn_base_loss, self.churn_component):
+            with reduced_churn(self, self.churn_reducer, self._churn_options()):
                 super().train()
 
     def learn(

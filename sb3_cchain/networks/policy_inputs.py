@@ -14,6 +14,29 @@ def n_observations(observations: PyTorchObs) -> int:
     return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
 
 
+def joined(first: PyTorchObs, second: PyTorchObs) -> PyTorchObs:
+    """
+    :param first: Batch of observations
+    :param second: Another one
+    :return: Both as one batch
+    """
+    if isinstance(first, dict) and isinstance(second, dict):
+        return {key: th.cat([first[key], second[key]]) for key in first}
+    assert th.is_tensor(first) and th.is_tensor(second)
+    return th.cat([first, second])
+
+
+def rows(observations: PyTorchObs, chosen: slice) -> PyTorchObs:
+    """
+    :param observations: Batch of observations
+    :param chosen: Which of them
+    :return: These, as a view
+    """
+    if isinstance(observations, dict):
+        return {key: tensor[chosen] for key, tensor in observations.items()}
+    return observations[chosen]
+
+
 def empty_memory(policy: Any, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
     """
     :param policy: A recurrent policy of sb3-contrib

@@ -45,11 +45,19 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
         ``MultiDiscrete`` (shorter sub-actions padded with 0) and ``(batch_size, n, 2)`` for ``MultiBinary`` actions;
         means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
     """
-    if _has_own_distribution(type(uncompiled(policy))):
+    if has_own_distribution(type(uncompiled(policy))):
         return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
-    outputs = policy.action_net(policy.mlp_extractor.forward_actor(features))
+    return of_action_net(policy, policy.action_net(policy.mlp_extractor.forward_actor(features)))
+
+
+def of_action_net(policy: ActorCriticPolicy, outputs: th.Tensor) -> th.Tensor:
+    """
+    :param policy: An actor-critic policy that makes its distribution as SB3's do
+    :param outputs: Outputs of its ``action_net``
+    :return: As of :func:`policy_outputs`
+    """
     distribution = policy.action_dist
     if isinstance(distribution, CategoricalDistribution):
         return outputs.softmax(dim=1)
@@ -60,7 +68,11 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
     return outputs
 
 
-def _has_own_distribution(policy_class: type[nn.Module]) -> bool:
+def has_own_distribution(policy_class: type[nn.Module]) -> bool:
+    """
+    :param policy_class: Class of an actor-critic policy
+    :return: Whether it makes its action distribution otherwise than SB3's
+    """
     return any(
         getattr(policy_class, name) is not getattr(ActorCriticPolicy, name)
         for name in ("get_distribution", "_get_action_dist_from_latent")

@@ -1,0 +1,88 @@
+"""
+C-CHAIN with other reference batches (``churn_reference``, ``churn_batch_size``), under the shipped hyperparameters otherwise:
+trains, and writes a table and learning curves for each environment. The same command goes on where it was interrupted.
+
+    python -m benchmarks.references --n-tasks 4 --steps-per-task 64000 --seeds 0 1 2 3
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.grid.executor import train_all
+from benchmarks.grid.results import Result
+from benchmarks.grid.run import Run, make_run, suite_methods
+from benchmarks.grid.suites import SUITES
+from benchmarks.report.figures import plot_learning_curves
+from benchmarks.report.markdown import markdown_table
+from benchmarks.report.task_tables import cost_table, mean_rows, returns_header, returns_rows
+
+SUITE = "gym_control"
+CCHAIN = suite_methods(SUITE)["cchain"]
+
+# What is compared: label and colour of each, and how it differs from the shipped hyperparameters
+LINES = {
+    "independent": replace(CCHAIN, label="independent"),
+    "next": replace(CCHAIN, label="next", color="tab:orange"),
+    "half": replace(CCHAIN, label="independent, half the size", color="tab:green"),
+}
+OVERRIDES = {"independent": (), "next": ("churn_reference:'next'",), "half": ("churn_batch_size:0.5",)}
+
+
+def variant_run(name: str, env_id: str, seed: int, n_tasks: int, steps: int) -> Run:
+    """
+    :param name: One of ``LINES``
+    :param env_id: Environment id
+    :param seed: Seed
+    :param n_tasks: Length of the task sequence
+    :param steps: Environment steps per task
+    :return: The run
+    """
+    run = make_run(SUITE, env_id, CCHAIN.name, seed, n_tasks, steps, f"references_{n_tasks}x{steps}")
+    return replace(run, variant=name, overrides=OVERRIDES[name])
+
+
+def write_report(results: Sequence[Result]) -> None:
+    """
+    Write ``table.md`` and ``curves.png`` beside the runs, and print the table.
+
+    :param results: All runs in one environment
+    """
+    rows = [*returns_rows(results, LINES), *mean_rows(results, LINES)]
+    tables = f"{markdown_table(returns_header(results[0].task_names), rows)}\n\n{cost_table(results, LINES)}"
+    folder = results[0].path.parents[1]
+    (folder / "table.md").write_text(tables + "\n")
+    plot_learning_curves(results, folder / "curves.png", LINES, results[0].env_id)
+    print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")
+
+
+def main() -> None:
+    """Parse the command line, train, write and print the tables and the curves."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    environments = ["Continual/Acrobot-v1", "Continual/LunarLander-v3"]
+    parser.add_argument("--env", nargs="+", default=environments, choices=SUITES[SUITE].env_ids, help="Environment ids")
+    parser.add_argument("--variants", nargs="+", default=list(LINES), choices=list(LINES), help="What is compared")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3], help="Seeds of agents and of the offsets")
+    parser.add_argument("--n-tasks", type=int, default=4, help="Length of the task sequence")
+    parser.add_argument("--steps-per-task", type=int, default=64_000, help="Environment steps per task")
+    parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
+    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
+    args = parser.parse_args()
+
+    try:
+        runs = [
+            variant_run(name, env_id, seed, args.n_tasks, args.steps_per_task)
+            for seed in args.seeds
+            for env_id in args.env
+            for name in args.variants
+        ]
+    except ValueError as error:
+        parser.error(str(error))
+    results = train_all(runs, args.output, args.jobs)
+    for env_id in args.env:
+        write_report([result for result in results if result.env_id == env_id])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""One forward pass of the actor for the minibatch that PPO evaluates and for further observations."""
+
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.distributions import (
+    DiagGaussianDistribution,
+    Distribution,
+    StateDependentNoiseDistribution,
+)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_cchain.networks.policy_inputs import joined, n_observations
+from sb3_cchain.networks.policy_outputs import has_own_distribution, has_training_mode
+
+
+class Evaluation(NamedTuple):
+    """What ``policy.evaluate_actions()`` returns of a minibatch, and the outputs of the actor that it is made of."""
+
+    values: th.Tensor
+    log_prob: th.Tensor
+    entropy: th.Tensor | None
+    # Outputs of `policy.action_net`: of the minibatch, then of the further observations
+    outputs: th.Tensor
+
+
+def can_evaluate_jointly(policy: ActorCriticPolicy) -> bool:
+    """
+    :param policy: An actor-critic policy
+    :return: Whether :func:`evaluate_jointly` does what its ``evaluate_actions()`` does: it evaluates actions and makes its
+        distribution as SB3's do, and the outputs of one sample depend neither on the others nor on training or evaluation mode
+    """
+    return (
+        getattr(policy.evaluate_actions, "__func__", None) is ActorCriticPolicy.evaluate_actions
+        and type(policy).extract_features is ActorCriticPolicy.extract_features
+        and not has_own_distribution(type(policy))
+        and not has_training_mode(policy)
+    )
+
+
+def evaluate_jointly(
+    policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None
+) -> Evaluation:
+    """
+    :param policy: An actor-critic policy, of which ``can_evaluate_jointly()`` is true
+    :param observations: Observations of the minibatch
+    :param actions: Its actions
+    :param further: Observations that go through the actor only; None for none
+    :return: The evaluation of the minibatch, and the actor's outputs on both
+    """
+    n = n_observations(observations)
+    together = observations if further is None else joined(observations, further)
+    actor_features = BasePolicy.extract_features(policy, together, policy.pi_features_extractor)
+    if policy.share_features_extractor:
+        critic_features = actor_features[:n]
+    else:
+        critic_features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
+    latent = policy.mlp_extractor.forward_actor(actor_features)
+    outputs = policy.action_net(latent)
+    distribution = _distribution(policy, latent[:n], outputs[:n])
+    values = policy.value_net(policy.mlp_extractor.forward_critic(critic_features))
+    return Evaluation(values, distribution.log_prob(actions), distribution.entropy(), outputs)
+
+
+def _distribution(policy: ActorCriticPolicy, latent: th.Tensor, outputs: th.Tensor) -> Distribution:
+    """As ``policy._get_action_dist_from_latent()``, which computes the outputs, too."""
+    if isinstance(policy.action_dist, StateDependentNoiseDistribution):
+        return policy.action_dist.proba_distribution(outputs, policy.log_std, latent)
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        return policy.action_dist.proba_distribution(outputs, policy.log_std)
+    return policy.action_dist.proba_distribution(outputs)

@@ -1,0 +1,134 @@
+"""Where CChainPPO's reference batches come from, and that they go through the policy with the minibatches."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from sb3_cchain import CChainPPO
+from sb3_cchain.algorithms import on_policy
+from sb3_cchain.algorithms.reference_batches import ReferenceBatches
+from tests.churn_models import (
+    ACTION_SPACES,
+    DICT,
+    assert_churn_was_reduced,
+    assert_close,
+    churn_keys,
+    learn_in_double_precision,
+)
+from tests.envs import RandomEnv
+
+# Of the arguments that the reference batches depend on: more samples than the minibatch has, and fewer
+REFERENCES = [("independent", 1.0), ("independent", 0.5), ("independent", 3.0), ("next", 1.0), ("next", 0.5), ("next", 2.5)]
+each_reference = pytest.mark.parametrize("kind, size", REFERENCES)
+
+
+# --- Which samples -----------------------------------------------------------------------------------------------------------
+
+
+def filled_buffer(n_samples):
+    """A rollout whose observations are 0, 1, 2, …"""
+    buffer = RolloutBuffer(n_samples, spaces.Box(0, 1000, (1,)), spaces.Discrete(2))
+    for index in range(n_samples):
+        buffer.add(np.array([[index]]), np.zeros((1, 1)), np.zeros(1), np.zeros(1), th.zeros(1), th.zeros(1))
+    return buffer
+
+
+def epoch(n_samples, batch_size, kind, size):
+    """Of each minibatch: its samples, those of its reference batch, and how many it shares with the reference batch before."""
+    buffer = filled_buffer(n_samples)
+    references = ReferenceBatches(buffer, kind, size)
+    return [
+        (minibatch.observations.flatten().tolist(), references.current.flatten().tolist(), references.n_shared)
+        for minibatch in references.get(batch_size)
+    ]
+
+
+@pytest.mark.parametrize("n_samples, batch_size", [(64, 16), (64, 32), (60, 20), (70, 32), (64, 8), (33, 8), (5, 1)])
+@each_reference
+def test_reference_batch_shares_nothing_with_its_minibatch(n_samples, batch_size, kind, size):
+    batches = epoch(n_samples, batch_size, kind, size)
+    assert sorted(sample for minibatch, *_ in batches for sample in minibatch) == list(range(n_samples))
+    for minibatch, reference, _ in batches:
+        assert not set(minibatch) & set(reference)
+        assert len(set(reference)) == len(reference) == min(max(round(size * batch_size), 1), n_samples - len(minibatch))
+
+
+@pytest.mark.parametrize("n_samples, batch_size", [(64, 16), (70, 32), (33, 8)])
+@each_reference
+def test_samples_shared_with_the_next_minibatch(n_samples, batch_size, kind, size):
+    batches = epoch(n_samples, batch_size, kind, size)
+    assert batches[0][2] == 0
+    for (_, reference, _), (minibatch, _, n_shared) in pairwise(batches):
+        if kind == "independent":
+            assert n_shared == 0
+        else:
+            assert n_shared == min(len(reference), len(minibatch)) > 0
+        assert reference[:n_shared] == minibatch[:n_shared]
+
+
+@pytest.mark.parametrize("size, n_expected", [(0.5, 8), (1.0, 16), (2.0, 16)])
+@pytest.mark.parametrize("kind", ["independent", "next"])
+def test_single_minibatch_is_its_own_reference_batch(kind, size, n_expected):
+    [(minibatch, reference, n_shared)] = epoch(16, 16, kind, size)
+    assert len(reference) == n_expected and set(reference) <= set(minibatch)
+    assert n_shared == 0
+
+
+def test_random_numbers_and_minibatches_are_those_of_the_buffer():
+    buffers = [filled_buffer(70) for _ in range(2)]
+    np.random.seed(0)
+    stock = [minibatch.observations.tolist() for _ in range(2) for minibatch in buffers[0].get(32)]
+    np.random.seed(0)
+    references = ReferenceBatches(buffers[1], "independent", 2.0)
+    assert [minibatch.observations.tolist() for _ in range(2) for minibatch in references.get(32)] == stock
+
+
+def test_buffer_that_takes_its_minibatches_otherwise():
+    class OwnBuffer(RolloutBuffer):
+        def get(self, batch_size=None):
+            yield from list(super().get(batch_size))
+            yield "a minibatch"
+
+    model = CChainPPO("MlpPolicy", RandomEnv(), rollout_buffer_class=OwnBuffer, n_steps=16, batch_size=8)
+    with pytest.raises(TypeError, match=r"OwnBuffer.get\(\) must gather its minibatches by `_get_samples\(indices\)`"):
+        model.learn(16)
+
+
+# --- How they go through the policy ------------------------------------------------------------------------------------------
+
+SETTINGS = dict(n_steps=64, batch_size=16, n_epochs=5, learning_rate=3e-3, ent_coef=0.01, seed=0, device="cpu")
+N_ITERATIONS = 10  # 200 updates
+
+
+FORMS_OF_POLICY = {
+    "Discrete": dict(env=lambda: RandomEnv()),
+    "MultiDiscrete": dict(env=lambda: RandomEnv(action_space=ACTION_SPACES[1])),
+    "MultiBinary": dict(env=lambda: RandomEnv(action_space=ACTION_SPACES[2])),
+    "Box": dict(env=lambda: RandomEnv(action_space=ACTION_SPACES[3])),
+    "gSDE": dict(env=lambda: RandomEnv(action_space=ACTION_SPACES[3]), use_sde=True),
+    "Dict": dict(env=lambda: RandomEnv(observation_space=DICT), policy="MultiInputPolicy"),
+    "own extractors": dict(env=lambda: RandomEnv(), policy_kwargs=dict(share_features_extractor=False)),
+}
+
+
+def learn(env, jointly, monkeypatch, **arguments):
+    with monkeypatch.context() as patch:
+        if not jointly:
+            patch.setattr(on_policy, "can_evaluate_jointly", lambda policy: False)
+        return learn_in_double_precision(CChainPPO, 64 * N_ITERATIONS, env(), **{**SETTINGS, **arguments})
+
+
+@each_reference
+@pytest.mark.parametrize("form", FORMS_OF_POLICY.values(), ids=FORMS_OF_POLICY)
+def test_joint_passes_make_the_same_updates(form, kind, size, monkeypatch):
+    arguments = dict(form, churn_reference=kind, churn_batch_size=size, churn_warmup=2)
+    joint, separate = (learn(jointly=jointly, monkeypatch=monkeypatch, **arguments) for jointly in (True, False))
+    assert joint.policy.optimizer.state_dict()["state"][0]["step"] == 200
+    assert_close(joint, separate, atol=1e-12)
+    assert_churn_was_reduced(joint)
+    for key in churn_keys(joint):
+        assert joint.logger.name_to_value[key] == pytest.approx(separate.logger.name_to_value[key], rel=1e-6), key
