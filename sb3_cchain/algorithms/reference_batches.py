@@ -7,10 +7,15 @@ import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_cchain.networks.policy_inputs import rows
 from sb3_cchain.replaced import replaced
 
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
+
+# Rollouts whose observations take at most this many bytes are gathered once per epoch, instead of once per minibatch; that is
+# another copy of the rollout
+GATHERED_AT_ONCE = 2**24
 
 
 class ReferenceBatches:
@@ -44,8 +49,9 @@ class ReferenceBatches:
         :param batch_size: Minibatch size
         :return: The minibatches of one epoch
         """
-        minibatches, gather = self._minibatches(batch_size)
+        minibatches = self._minibatch_indices(batch_size)
         epoch = np.concatenate(minibatches)
+        samples = self._samples_at(epoch)
         full_size = len(minibatches[0])
         half_an_epoch = (len(minibatches) + 1) // 2 * full_size
         end = n_in_next = 0
@@ -59,17 +65,11 @@ class ReferenceBatches:
                 start += max(min(half_an_epoch - len(indices), n_outside - size), 0)
             elif position + 1 < len(minibatches):
                 n_in_next = min(size, len(minibatches[position + 1]))
-            self.current = gather(epoch.take(range(start, start + size), mode="wrap")).observations
+            self.current = samples(start % len(epoch), size).observations
             self.starts_epoch = position == 0
-            yield gather(indices)
+            yield samples(end - len(indices), len(indices))
 
-    def _minibatches(self, batch_size: int | None) -> tuple[list[np.ndarray], Callable[[np.ndarray], Any]]:
-        """
-        :param batch_size: Minibatch size
-        :return: The indices of an epoch's minibatches, and what gathers their samples; all of the samples at once would be the
-            rollout once more
-        """
-        gather = self._buffer._get_samples
+    def _minibatch_indices(self, batch_size: int | None) -> list[np.ndarray]:
         minibatches: list[Any]
         with replaced(self._buffer, "_get_samples", lambda indices, env=None: indices):
             minibatches = list(self._get(batch_size))
@@ -78,4 +78,30 @@ class ReferenceBatches:
                 f"{type(self._buffer).__name__}.get() must gather its minibatches by `_get_samples(indices)`, as "
                 "SB3's rollout buffers do"
             )
-        return minibatches, gather
+        return minibatches
+
+    def _samples_at(self, epoch: np.ndarray) -> Callable[[int, int], Any]:
+        """
+        :param epoch: Indices of all samples in the order of the epoch
+        :return: What gives so many samples from a position in it on; the first follow the last
+        """
+        gather = self._buffer._get_samples
+
+        def from_buffer(start: int, size: int) -> Any:
+            return gather(epoch.take(range(start, start + size), mode="wrap"))
+
+        if self._n_bytes() > GATHERED_AT_ONCE:
+            return from_buffer
+        # Gathering all at once takes less time
+        everything = from_buffer(0, len(epoch))
+
+        def from_epoch(start: int, size: int) -> Any:
+            if start + size > len(epoch):
+                return from_buffer(start, size)
+            return type(everything)(*(rows(part, slice(start, start + size)) for part in everything))
+
+        return from_epoch
+
+    def _n_bytes(self) -> int:
+        observations = self._buffer.observations
+        return sum(array.nbytes for array in (observations.values() if isinstance(observations, dict) else [observations]))

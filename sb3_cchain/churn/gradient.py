@@ -1,4 +1,4 @@
-"""Adds a gradient to every update of a training loop that cannot be changed."""
+"""Adds a loss, or a gradient, to every update of a training loop that cannot be changed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,3 +31,26 @@ def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) 
 
     with replaced(optimizer, "zero_grad", zero_grad_and_backward):
         yield
+
+
+def carrying(tensor: th.Tensor, loss: th.Tensor) -> th.Tensor:
+    """
+    Let a tensor that the loop's loss is computed from carry a further loss: the loop's own ``backward()`` then adds its
+    gradient, too.
+
+    :param tensor: What the loop's loss depends on
+    :param loss: A scalar
+    :return: The tensor, with the same values
+    """
+    return _Carrying.apply(tensor, loss)
+
+
+class _Carrying(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tensor: th.Tensor, loss: th.Tensor) -> th.Tensor:
+        ctx.loss_options = dict(dtype=loss.dtype, device=loss.device)
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return gradient, th.ones((), **ctx.loss_options)

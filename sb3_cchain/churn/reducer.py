@@ -90,9 +90,20 @@ class ChurnReducer(nn.Module):
         :raises ValueError: When the churn loss, or λ times it, is NaN or infinite
         """
         assert self.old_outputs is not None
+        churn_loss = self.divergence(self.old_outputs, new_outputs)
+        self.record(churn_loss)
+        return self._coef * churn_loss
+
+    def record(self, churn_loss: th.Tensor) -> None:
+        """
+        Count a churn loss as that of the update that is about to be made. :meth:`loss` does so by itself.
+
+        :param churn_loss: L_churn on ``self.reference``, not multiplied by λ
+        :raises ValueError: When it, or λ times it, is NaN or infinite
+        """
+        assert self.old_outputs is not None
         if not self.losses:  # λ changes between iterations only
             self._coef = self.coefficient.value
-        churn_loss = self.divergence(self.old_outputs, new_outputs)
         loss = churn_loss.item()
         _check_finite(loss, self._coef, th.finfo(churn_loss.dtype).max)
         self.losses.append(loss)
@@ -100,9 +111,9 @@ class ChurnReducer(nn.Module):
             loss_without_churn = 0.0  # not computed, because each update of DQN would pay for it
         else:
             loss_without_churn = self.divergence(self.old_outputs, self.old_outputs).item()
-        self._n_samples += len(new_outputs)
-        self._churn_sum += len(new_outputs) * (loss - loss_without_churn)
-        return self._coef * churn_loss
+        n_samples = len(self.old_outputs)
+        self._n_samples += n_samples
+        self._churn_sum += n_samples * (loss - loss_without_churn)
 
     def remember(self, reference: Observations, outputs: th.Tensor | None = None) -> None:
         """

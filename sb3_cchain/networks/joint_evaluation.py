@@ -40,17 +40,19 @@ def can_evaluate_jointly(policy: ActorCriticPolicy) -> bool:
 
 
 def evaluate_jointly(
-    policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None
+    policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None = None
 ) -> Evaluation:
     """
     :param policy: An actor-critic policy, of which ``can_evaluate_jointly()`` is true
     :param observations: Observations of the minibatch
     :param actions: Its actions
-    :param further: Observations that go through the actor only; None for none
+    :param further: Observations that go through the actor only; None, or an empty batch, for none
     :return: The evaluation of the minibatch, and the actor's outputs on both
     """
     n = n_observations(observations)
-    together = observations if further is None else joined(observations, further)
+    together = observations
+    if further is not None and n_observations(further) > 0:
+        together = joined(observations, further)
     actor_features = BasePolicy.extract_features(policy, together, policy.pi_features_extractor)
     if policy.share_features_extractor:
         critic_features = actor_features[:n]
