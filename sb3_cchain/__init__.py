@@ -6,6 +6,7 @@ from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQ
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.envs import ContinualEnv, register_envs
+from sb3_cchain.networks import make_lean
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tensorboard import TensorBoardOverview
 
@@ -20,6 +21,7 @@ __all__ = [
     "DoubleDQN",
     "TaskSync",
     "TensorBoardOverview",
+    "make_lean",
 ]
 
 register_envs()

@@ -209,6 +209,9 @@ def test_hyperparameters(tmp_path):
         "reset_churn_coef": "False",
         "churn_base_loss": "actor",
         "churn_component": "full",
+        "churn_reference": "independent",
+        "churn_batch_size": 1.0,
+        "lean_distributions": "True",
     }
 
 

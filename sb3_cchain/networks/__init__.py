@@ -3,6 +3,7 @@
 from sb3_cchain.networks.activations import CReLU
 from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.mlp_policies import CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "LayerNormDQNPolicy",
     "LayerNormPolicy",
     "MinAtarCNN",
+    "make_lean",
 ]

@@ -7,6 +7,7 @@ For one observation, building and checking ``torch.distributions`` takes as long
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, TypeVar
 
 import torch as th
@@ -19,13 +20,38 @@ from stable_baselines3.common.distributions import (
     sum_independent_dims,
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.distributions import Bernoulli, Categorical, Normal
 from torch.nn import functional as F
 
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.policy_outputs import has_own_distribution
 
 OnPolicyModel = TypeVar("OnPolicyModel", bound=OnPolicyAlgorithm)
+
+
+class _Categorical:
+    """What policies ask of torch's ``Categorical``, with its attributes' names: logits are ``(batch_size, n_actions)``."""
+
+    def __init__(self, logits: th.Tensor):
+        self.logits = logits - logits.logsumexp(dim=-1, keepdim=True)
+
+    @cached_property
+    def probs(self) -> th.Tensor:
+        return self.logits.softmax(dim=-1)
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        return self.logits.gather(-1, actions.long().unsqueeze(-1)).squeeze(-1)
+
+    def entropy(self) -> th.Tensor:
+        # The least number in place of minus infinity: its product with a probability of 0 is 0
+        finite = self.logits.clamp(min=th.finfo(self.logits.dtype).min)
+        return -(finite * self.probs).sum(-1)
+
+    def sample(self) -> th.Tensor:
+        return th.multinomial(self.probs, 1, replacement=True).squeeze(-1)
+
+    def mode(self) -> th.Tensor:
+        return self.probs.argmax(dim=1)
 
 
 class LeanCategorical(CategoricalDistribution):
@@ -36,39 +62,39 @@ class LeanCategorical(CategoricalDistribution):
         :param action_logits: Logits, ``(batch_size, n_actions)``
         :return: self
         """
-        self.action_logits = action_logits
-        self.log_probs = _log_probs(action_logits)
+        self._action_logits = action_logits
+        self._lean = _Categorical(action_logits)
         return self
 
     @property
     def distribution(self) -> Categorical:  # type: ignore[override]
-        """As SB3 has it. Nothing here uses it."""
-        return Categorical(logits=self.action_logits)
+        """Torch's, as SB3 has it, made when it is asked for."""
+        return Categorical(logits=self._action_logits)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
         :param actions: Actions, ``(batch_size,)``
         :return: Log-probabilities, ``(batch_size,)``
         """
-        return _log_prob(self.log_probs, actions)
+        return self._lean.log_prob(actions)
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
-        return _entropy(self.log_probs)
+        return self._lean.entropy()
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size,)``
         """
-        return _sample(self.log_probs)
+        return self._lean.sample()
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size,)``
         """
-        return _mode(self.log_probs)
+        return self._lean.mode()
 
 
 class LeanMultiCategorical(MultiCategoricalDistribution):
@@ -79,68 +105,42 @@ class LeanMultiCategorical(MultiCategoricalDistribution):
         :param action_logits: Logits of all sub-actions, ``(batch_size, sum of their numbers of values)``
         :return: self
         """
-        self.action_logits = action_logits.split(list(self.action_dims), dim=1)
-        self.log_probs = [_log_probs(logits) for logits in self.action_logits]
+        self._action_logits = action_logits.split(list(self.action_dims), dim=1)
+        self._lean = [_Categorical(logits) for logits in self._action_logits]
         return self
 
     @property
     def distribution(self) -> list[Categorical]:  # type: ignore[override]
-        """As SB3 has it. Nothing here uses it."""
-        return [Categorical(logits=logits) for logits in self.action_logits]
+        """Torch's, as SB3 has them, made when they are asked for."""
+        return [Categorical(logits=logits) for logits in self._action_logits]
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
         :param actions: Actions, ``(batch_size, n_sub_actions)``
         :return: Log-probabilities, ``(batch_size,)``
         """
-        return self._stack(map(_log_prob, self.log_probs, actions.unbind(dim=1))).sum(dim=1)
+        sub_actions = actions.unbind(dim=1)
+        return th.stack([lean.log_prob(action) for lean, action in zip(self._lean, sub_actions, strict=True)], dim=1).sum(
+            dim=1
+        )
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
-        return self._stack(map(_entropy, self.log_probs)).sum(dim=1)
+        return th.stack([lean.entropy() for lean in self._lean], dim=1).sum(dim=1)
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
-        return self._stack(map(_sample, self.log_probs))
+        return th.stack([lean.sample() for lean in self._lean], dim=1)
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size, n_sub_actions)``
         """
-        return self._stack(map(_mode, self.log_probs))
-
-    @staticmethod
-    def _stack(of_sub_actions: Any) -> th.Tensor:
-        return th.stack(list(of_sub_actions), dim=1)
-
-
-# A categorical distribution of logarithms of probabilities, ``(batch_size, n_actions)``
-
-
-def _log_probs(logits: th.Tensor) -> th.Tensor:
-    return logits - logits.logsumexp(dim=-1, keepdim=True)
-
-
-def _log_prob(log_probs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    return log_probs.gather(-1, actions.long().unsqueeze(-1)).squeeze(-1)
-
-
-def _entropy(log_probs: th.Tensor) -> th.Tensor:
-    # The least number in place of minus infinity: its product with a probability of 0 is 0
-    finite = log_probs.clamp(min=th.finfo(log_probs.dtype).min)
-    return -(finite * log_probs.softmax(dim=-1)).sum(-1)
-
-
-def _sample(log_probs: th.Tensor) -> th.Tensor:
-    return th.multinomial(log_probs.softmax(dim=-1), 1, replacement=True).squeeze(-1)
-
-
-def _mode(log_probs: th.Tensor) -> th.Tensor:
-    return log_probs.softmax(dim=-1).argmax(dim=1)
+        return th.stack([lean.mode() for lean in self._lean], dim=1)
 
 
 class LeanBernoulli(BernoulliDistribution):
@@ -151,39 +151,39 @@ class LeanBernoulli(BernoulliDistribution):
         :param action_logits: Logits, ``(batch_size, n_sub_actions)``
         :return: self
         """
-        self.action_logits = action_logits
+        self._action_logits = action_logits
         return self
 
     @property
     def distribution(self) -> Bernoulli:  # type: ignore[override]
-        """As SB3 has it. Nothing here uses it."""
-        return Bernoulli(logits=self.action_logits)
+        """Torch's, as SB3 has it, made when it is asked for."""
+        return Bernoulli(logits=self._action_logits)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
         :param actions: Actions, ``(batch_size, n_sub_actions)``
         :return: Log-probabilities, ``(batch_size,)``
         """
-        return -F.binary_cross_entropy_with_logits(self.action_logits, actions, reduction="none").sum(dim=1)
+        return (-F.binary_cross_entropy_with_logits(self._action_logits, actions, reduction="none")).sum(dim=1)
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
-        probs = self.action_logits.sigmoid()
-        return F.binary_cross_entropy_with_logits(self.action_logits, probs, reduction="none").sum(dim=1)
+        probs = self._action_logits.sigmoid()
+        return F.binary_cross_entropy_with_logits(self._action_logits, probs, reduction="none").sum(dim=1)
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
-        return self.action_logits.detach().sigmoid().bernoulli()
+        return self._action_logits.detach().sigmoid().bernoulli()
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size, n_sub_actions)``
         """
-        return self.action_logits.sigmoid().round()
+        return self._action_logits.sigmoid().round()
 
 
 class LeanDiagGaussian(DiagGaussianDistribution):
@@ -195,41 +195,42 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :param log_std: Logarithms of the standard deviations, ``(action_dim,)``
         :return: self
         """
-        self.mean_actions = mean_actions
-        self.action_std = th.ones_like(mean_actions) * log_std.exp()
+        self._mean = mean_actions
+        self._std = th.ones_like(mean_actions) * log_std.exp()
         return self
 
     @property
     def distribution(self) -> Normal:  # type: ignore[override]
-        """As SB3 has it. Nothing here uses it."""
-        return Normal(self.mean_actions, self.action_std)
+        """Torch's, as SB3 has it, made when it is asked for."""
+        return Normal(self._mean, self._std)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
         :param actions: Actions, ``(batch_size, action_dim)``
         :return: Log-densities, ``(batch_size,)``
         """
-        exponents = -((actions - self.mean_actions) ** 2) / (2 * self.action_std**2)
-        return sum_independent_dims(exponents - self.action_std.log() - math.log(math.sqrt(2 * math.pi)))
+        variance = self._std**2
+        squares = -((actions - self._mean) ** 2) / (2 * variance)
+        return sum_independent_dims(squares - self._std.log() - math.log(math.sqrt(2 * math.pi)))
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
-        return sum_independent_dims(0.5 + 0.5 * math.log(2 * math.pi) + self.action_std.log())
+        return sum_independent_dims(0.5 + 0.5 * math.log(2 * math.pi) + self._std.log())
 
     def sample(self) -> th.Tensor:
         """
-        :return: Actions, ``(batch_size, action_dim)``, with the gradient of the parameters
+        :return: Actions, ``(batch_size, action_dim)``, through which gradients flow
         """
-        noise = th.empty(self.mean_actions.shape, dtype=self.mean_actions.dtype, device=self.mean_actions.device).normal_()
-        return self.mean_actions + noise * self.action_std
+        noise = th.empty(self._mean.shape, dtype=self._mean.dtype, device=self._mean.device).normal_()
+        return self._mean + noise * self._std
 
     def mode(self) -> th.Tensor:
         """
         :return: Means, ``(batch_size, action_dim)``
         """
-        return self.mean_actions
+        return self._mean
 
 
 # By the class of SB3's distribution, how to make the lean one from it
@@ -257,6 +258,7 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     policy = uncompiled(model.policy)
     # The very class: a subclass may do something else
     make = _LEAN.get(type(policy.action_dist))
-    if make is not None and not has_own_distribution(type(policy)):
+    makes_its_own = type(policy)._get_action_dist_from_latent is not ActorCriticPolicy._get_action_dist_from_latent
+    if make is not None and not makes_its_own:
         policy.action_dist = make(policy.action_dist)
     return model
