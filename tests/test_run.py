@@ -144,13 +144,19 @@ BAD_CHURN_ARGUMENTS = [
     ("churn_window", 0),
     ("churn_coef_min", -1),
 ]
+BAD_POLICY_ARGUMENTS = [
+    ("churn_base_loss", "value"),
+    ("churn_reference", "previous"),
+    ("churn_batch_size", 0),
+    ("churn_batch_size", "half"),
+]
 
 
 @pytest.mark.parametrize(
     "name, argument, value",
     [
         *((name, *bad) for name in FORMS for bad in BAD_CHURN_ARGUMENTS),
-        *((name, "churn_base_loss", "value") for name in ("CChainPPO", "CChainCallback")),
+        *((name, *bad) for name in ("CChainPPO", "CChainCallback") for bad in BAD_POLICY_ARGUMENTS),
     ],
 )
 def test_bad_churn_arguments(name, argument, value):

@@ -13,6 +13,7 @@ import sb3_cchain.zoo.cli as zoo
 import sb3_cchain.zoo.search as search
 import sb3_cchain.zoo.settings
 from sb3_cchain.algorithms import CChainDQN, CChainPPO
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from tests.zoo_command import FAST, NO_EVALUATION, command
 
@@ -66,6 +67,14 @@ def test_the_range_of_beta_depends_on_the_actions(algo, n_actions, low, high):
     ratios = [sample(study.ask(), n_actions, 1, {})["target_churn_ratio"] for _ in range(20)]
     assert low <= min(ratios) < max(ratios) <= high
     assert np.ptp(np.log10(ratios)) > 1
+
+
+def test_reference_batches_are_searched_for_ppo():
+    search.register_search_spaces()
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    sampled = [search.HYPERPARAMS_SAMPLER["ppo_cchain"](study.ask(), 0, 1, {}) for _ in range(40)]
+    assert {each["churn_reference"] for each in sampled} == set(REFERENCES)
+    assert {each["churn_batch_size"] for each in sampled} == {0.25, 0.5, 1.0, 2.0, 4.0, 8.0}
 
 
 def test_the_papers_grids():

@@ -12,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.algorithms import DoubleDQN
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.methods.registry import REGISTRY, Method
 
 # Arguments: Optuna's trial, the dimension of continuous actions (0 for others), the number of environments, and RL Zoo's
@@ -64,22 +65,27 @@ def convert_double_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
-def with_target_churn_ratio(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sampler:
+def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sampler:
     """
     :param sampler: Search space of the algorithm without churn reduction
     :param algorithm: An algorithm with churn reduction
-    :return: The same search space, and β: a decade beyond the paper's values on either side
+    :return: The same search space, and β: a decade beyond the paper's values on either side. With PPO also where the reference
+        batches are taken from, and their size.
     """
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+        sampled = sampler(trial, n_actions, n_envs, additional_args)
         if not issubclass(algorithm, OnPolicyAlgorithm):
             low, high = 1e-3, 1e-1  # around 0.01
         elif n_actions > 0:
             low, high = 5e-3, 5.0  # around 0.05 to 0.5
         else:
             low, high = 1e2, 1e6  # around 1e3 to 1e5
-        target_churn_ratio = trial.suggest_float("target_churn_ratio", low, high, log=True)
-        return {**sampler(trial, n_actions, n_envs, additional_args), "target_churn_ratio": target_churn_ratio}
+        sampled["target_churn_ratio"] = trial.suggest_float("target_churn_ratio", low, high, log=True)
+        if issubclass(algorithm, OnPolicyAlgorithm):
+            sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
+            sampled["churn_batch_size"] = trial.suggest_categorical("churn_batch_size", [0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
+        return sampled
 
     return sample
 
@@ -113,7 +119,7 @@ def register_search_spaces() -> None:
                 continue
             sampler, HYPERPARAMS_CONVERTER[method.algo] = space
             has_churn = issubclass(method.algorithm, ChurnAlgorithm)
-            HYPERPARAMS_SAMPLER[method.algo] = with_target_churn_ratio(sampler, method.algorithm) if has_churn else sampler
+            HYPERPARAMS_SAMPLER[method.algo] = with_churn_arguments(sampler, method.algorithm) if has_churn else sampler
 
 
 def suggest_from_grid(trial: optuna.Trial, method: Method) -> dict[str, Any]:
