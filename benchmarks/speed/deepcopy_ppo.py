@@ -19,15 +19,26 @@ class DeepCopyPPO(PPO):
     :param target_churn_ratio: β
     :param churn_warmup: Iterations with λ = 1
     :param churn_window: Iterations that the running means go over
+    :param churn_reference: Where reference batches are taken from: ``"independent"`` or ``"next"``
+    :param churn_batch_size: Size of a reference batch in minibatches, at most 2
     :param kwargs: Keyword arguments of PPO
     """
 
     def __init__(
-        self, *args: Any, target_churn_ratio: float = 1e4, churn_warmup: int = 10, churn_window: int = 50, **kwargs: Any
+        self,
+        *args: Any,
+        target_churn_ratio: float = 1e4,
+        churn_warmup: int = 10,
+        churn_window: int = 50,
+        churn_reference: str = "independent",
+        churn_batch_size: float = 1.0,
+        **kwargs: Any,
     ):
         self.target_churn_ratio = target_churn_ratio
         self.churn_warmup = churn_warmup
         self.churn_window = churn_window
+        self.churn_reference = churn_reference
+        self.churn_batch_size = churn_batch_size
         self.actor_losses: list[float] = []
         self.churn_losses: list[float] = []
         self.old_policy: Any = None
@@ -78,8 +89,10 @@ class DeepCopyPPO(PPO):
                     loss = loss + churn_coef * churn_loss
                     churn_losses.append(churn_loss.item())
 
-                # Half an epoch away: shares no sample with this minibatch
-                self.reference = minibatches[(i + (len(minibatches) + 1) // 2) % len(minibatches)].observations
+                # The next minibatch, or the one half an epoch away: neither shares a sample with this one
+                first = i + (1 if self.churn_reference == "next" else (len(minibatches) + 1) // 2)
+                following = [minibatches[(first + j) % len(minibatches)].observations for j in range(2)]
+                self.reference = th.cat(following)[: round(self.churn_batch_size * self.batch_size)]
                 # The network alone, without its optimiser and its last action distribution
                 kept: dict[int, Any] = {id(part): part for part in (self.policy.optimizer, self.policy.action_dist)}
                 self.old_policy = copy.deepcopy(self.policy, memo=kept)
