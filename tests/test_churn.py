@@ -1,7 +1,9 @@
 """The torch-only part: divergences, λ, the reducer, the seam."""
 
+import copy
 import gc
 import math
+import pickle
 import random
 import re
 import statistics
@@ -104,6 +106,19 @@ def test_adaptive_coefficient_state_is_restored():
     for c in (coef, restored):
         c.update(3.0, 0.1)
     assert restored.value == coef.value
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda coef: pickle.loads(pickle.dumps(coef))])
+def test_a_copy_of_an_adaptive_coefficient_goes_on_alone(duplicate):
+    coef = AdaptiveChurnCoefficient(target_ratio=2.0, warmup=0, window=3)
+    coef.update(1.0, 2.0)
+    other = duplicate(coef)
+    assert other.value == coef.value
+    other.update(5.0, 2.0)
+    assert coef.value == pytest.approx(2 * 1 / 2)
+    assert other.value == pytest.approx(2 * (1 + 5) / (2 + 2))
+    coef.update(5.0, 2.0)
+    assert coef.value == other.value
 
 
 @pytest.mark.parametrize("coef", [ChurnCoefficient(1.0), AdaptiveChurnCoefficient(1.0, warmup=0)])

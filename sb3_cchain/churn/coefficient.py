@@ -122,14 +122,16 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         """
         super().update(base_loss, churn_loss)
         slot = int(self.n_seen) % len(self.base_losses)
-        for index, (history, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
+        sums = self.sums.numpy()
+        for index, (buffer, loss) in enumerate(((self.base_losses, base_loss), (self.churn_losses, churn_loss))):
+            history = buffer.numpy()  # the same memory; elements of a tensor take ten times as long to read and write
             forgotten = float(history[slot])
             history[slot] = abs(loss)
-            self.sums[index] += abs(loss) - forgotten
+            sums[index] += abs(loss) - forgotten
             # Recompute the sum once per window, and when most of it leaves, so that rounding errors do not add up or stay
-            if slot == len(history) - 1 or forgotten > self.sums[index]:
-                self.sums[index] = history.sum()
-        self.n_seen += 1
+            if slot == len(history) - 1 or forgotten > sums[index]:
+                sums[index] = buffer.sum()
+        self.n_seen.add_(1)
 
     def reset(self) -> None:
         """Forget the losses seen and begin a new warm-up."""
