@@ -65,7 +65,10 @@ def action_changes(old: th.Tensor, new: th.Tensor) -> float:
     :raises ValueError: When the shapes differ or the batch is empty
     """
     check_batches(old, new)
-    return (old != new).reshape(len(old), -1).any(dim=1).sum().item() / len(old)
+    changed = old != new
+    if changed.dim() > 1:
+        changed = changed.flatten(start_dim=1).any(dim=1)
+    return changed.sum().item() / len(old)
 
 
 def check_batches(old: th.Tensor, new: th.Tensor, n_dims: int = 1) -> None:
