@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSam
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
 from sb3_cchain.algorithms.off_policy import QValues, finite_td_loss, joint_pass, log_q_churn, make_q_reducer
+from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
@@ -70,7 +71,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
         # Independent of the minibatch. It waits for the next update, which measures on it what this update changes
         assert self.replay_buffer is not None
-        reference = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env).observations
+        reference = sample_observations(self.replay_buffer, batch_size, self._vec_normalize_env)
         values = self._all_q_values(replay_data, reference)
 
         td_loss = self._td_loss(replay_data, values.current, values.next)

@@ -1,0 +1,132 @@
+"""Observations drawn from a replay buffer are those that its ``sample()`` would draw."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_cchain.algorithms.replay_observations import sample_observations
+from tests.churn_models import DICT
+from tests.envs import RandomEnv
+
+
+class GenerousBuffer(ReplayBuffer):
+    """Twice as many samples as it is asked for."""
+
+    def sample(self, batch_size, env=None):
+        return super().sample(2 * batch_size, env)
+
+
+class NegatingBuffer(ReplayBuffer):
+    """Minus the observations."""
+
+    def _get_samples(self, batch_inds, env=None):
+        samples = super()._get_samples(batch_inds, env)
+        return samples._replace(observations=-samples.observations)
+
+
+CompactBuffer = partial(ReplayBuffer, optimize_memory_usage=True, handle_timeout_termination=False)
+
+# By name: buffer, environment, whether only its observations are read
+BUFFERS = {
+    "Box": (ReplayBuffer, RandomEnv, True),
+    "images": (ReplayBuffer, partial(RandomEnv, spaces.Box(0, 255, (3, 8, 8), np.uint8)), True),
+    "Discrete": (ReplayBuffer, partial(RandomEnv, spaces.Discrete(5)), True),
+    "compact": (CompactBuffer, RandomEnv, True),
+    "Dict": (DictReplayBuffer, partial(RandomEnv, DICT), True),
+    "n steps": (NStepReplayBuffer, RandomEnv, True),
+    "HER": (HerReplayBuffer, partial(BitFlippingEnv, n_bits=3), False),
+    "own sample()": (GenerousBuffer, RandomEnv, False),
+    "own _get_samples()": (NegatingBuffer, RandomEnv, False),
+}
+
+
+def fill(buffer, env, n_steps):
+    observations = env.reset()
+    for _ in range(n_steps):
+        actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
+        next_observations, rewards, dones, infos = env.step(actions)
+        buffer.add(observations, next_observations, actions, rewards, dones, infos)
+        observations = next_observations
+
+
+def make_buffer(name, n_envs=1, n_steps=30, capacity=50):
+    make, make_env, _ = BUFFERS[name]
+    env = make_vec_env(make_env, n_envs=n_envs, seed=0)
+    arguments = dict(env=env) if make is HerReplayBuffer else {}
+    buffer = make(capacity * n_envs, env.observation_space, env.action_space, device="cpu", n_envs=n_envs, **arguments)
+    fill(buffer, env, n_steps)
+    return buffer, env
+
+
+def draw(call):
+    """
+    :return: The observations by key, and a random number drawn after them
+    """
+    np.random.seed(3)
+    observations = call()
+    return observations if isinstance(observations, dict) else {"": observations}, np.random.random()
+
+
+def assert_equal_draws(buffer, env=None):
+    expected, number_after = draw(lambda: buffer.sample(16, env=env).observations)
+    drawn, number_after_drawn = draw(lambda: sample_observations(buffer, 16, env))
+    assert number_after_drawn == number_after
+    assert drawn.keys() == expected.keys()
+    for key, tensor in expected.items():
+        assert drawn[key].dtype == tensor.dtype and th.equal(drawn[key], tensor)
+    assert len({tuple(row) for row in next(iter(expected.values())).flatten(start_dim=1).tolist()}) > 2
+
+
+@pytest.mark.parametrize("n_steps", [30, 50, 70])
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("name", BUFFERS)
+def test_same_observations_and_random_numbers_as_sample(name, n_envs, n_steps):
+    buffer, _ = make_buffer(name, n_envs, n_steps)
+    assert buffer.full == (n_steps >= 50)
+    assert_equal_draws(buffer)
+
+
+@pytest.mark.parametrize("name", ["Box", "compact", "Dict", "n steps"])
+def test_normalised_observations(name):
+    buffer, env = make_buffer(name, n_envs=2)
+    normalize = VecNormalize(env, norm_obs_keys=["a"] if name == "Dict" else None)
+    normalize.reset()
+    for _ in range(20):
+        normalize.step(np.array([env.action_space.sample() for _ in range(2)]))
+    plain, _ = draw(lambda: sample_observations(buffer, 16, None))
+    normalised, _ = draw(lambda: sample_observations(buffer, 16, normalize))
+    assert any(not th.equal(plain[key], normalised[key]) for key in plain)
+    assert_equal_draws(buffer, normalize)
+
+
+@pytest.mark.parametrize("name", BUFFERS)
+def test_the_rest_is_not_read_from_buffers_that_are_known(name):
+    buffer, _ = make_buffer(name)
+    del buffer.actions, buffer.rewards
+    if BUFFERS[name][-1]:
+        assert sample_observations(buffer, 16, None) is not None
+    else:
+        with pytest.raises(AttributeError):
+            sample_observations(buffer, 16, None)
+
+
+@pytest.mark.parametrize("method", ["sample", "_get_samples"])
+def test_a_method_of_the_buffer_that_was_replaced_is_called(method, monkeypatch):
+    buffer, _ = make_buffer("Box")
+    calls, original = [], getattr(buffer, method)
+
+    def replacement(*args, **kwargs):
+        calls.append(args)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(buffer, method, replacement)
+    assert len(sample_observations(buffer, 16, None)) == 16
+    assert len(calls) == 1
