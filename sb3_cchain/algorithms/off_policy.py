@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, mean_squared_difference
 from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
-from sb3_cchain.networks.policy_inputs import n_observations
+from sb3_cchain.networks.policy_inputs import joined, n_observations
 
 # β when `target_churn_ratio="auto"`: the paper's
 DEFAULT_TARGET_RATIO = 0.01
@@ -84,12 +84,9 @@ def _both(
     q_net: Callable[[Observations], th.Tensor], minibatch: Observations, reference: Observations
 ) -> tuple[th.Tensor, th.Tensor]:
     """One pass for two batches."""
-    if isinstance(minibatch, dict) and isinstance(reference, dict):
-        together: Observations = {key: th.cat([minibatch[key], reference[key]]) for key in minibatch}
-    else:
-        assert th.is_tensor(minibatch) and th.is_tensor(reference)
-        together = th.cat([minibatch, reference])
-    values, reference_values = q_net(together).split([n_observations(minibatch), n_observations(reference)])
+    values, reference_values = q_net(joined(minibatch, reference)).split(
+        [n_observations(minibatch), n_observations(reference)]
+    )
     return values, reference_values
 
 
