@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
 from sb3_cchain import CChainPPO
-from sb3_cchain.algorithms import on_policy
+from sb3_cchain.algorithms import on_policy, reference_batches
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
     assert_churn_was_reduced,
     assert_close,
+    assert_equal,
     churn_keys,
     learn_in_double_precision,
 )
@@ -40,6 +41,7 @@ def filled_buffer(n_samples):
 def epoch(n_samples, batch_size, kind, size):
     """Of each minibatch: its samples, those of its reference batch, and how many it shares with the reference batch before."""
     buffer = filled_buffer(n_samples)
+    np.random.seed(0)
     references = ReferenceBatches(buffer, kind, size)
     return [
         (minibatch.observations.flatten().tolist(), references.current.flatten().tolist(), references.n_shared)
@@ -87,15 +89,47 @@ def test_random_numbers_and_minibatches_are_those_of_the_buffer():
     assert [minibatch.observations.tolist() for _ in range(2) for minibatch in references.get(32)] == stock
 
 
-def test_buffer_that_takes_its_minibatches_otherwise():
-    class OwnBuffer(RolloutBuffer):
-        def get(self, batch_size=None):
-            yield from list(super().get(batch_size))
-            yield "a minibatch"
+class OwnBuffer(RolloutBuffer):
+    """Makes its minibatches in its own way."""
 
-    model = CChainPPO("MlpPolicy", RandomEnv(), rollout_buffer_class=OwnBuffer, n_steps=16, batch_size=8)
-    with pytest.raises(TypeError, match=r"OwnBuffer.get\(\) must gather its minibatches by `_get_samples\(indices\)`"):
-        model.learn(16)
+    def get(self, batch_size=None):
+        for minibatch in super().get(batch_size):
+            yield minibatch._replace(observations=-minibatch.observations)
+
+
+class OwnDictBuffer(DictRolloutBuffer):
+    def get(self, batch_size=None):
+        yield from super().get(batch_size)
+
+
+@each_reference
+def test_buffers_are_read_in_the_same_order(kind, size, monkeypatch):
+    held = epoch(70, 32, kind, size)
+    monkeypatch.setattr(reference_batches, "HELD_AT_MOST", 0)
+    gathered = epoch(70, 32, kind, size)
+    monkeypatch.setattr("tests.test_reference_batches.RolloutBuffer", OwnBuffer)
+    own = epoch(70, 32, kind, size)
+    assert gathered == held
+    assert own == [([-x for x in minibatch], [-x for x in reference], n) for minibatch, reference, n in held]
+
+
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+@pytest.mark.parametrize("limit", [0, 2**24])
+@pytest.mark.parametrize("buffer_class", [None, DictRolloutBuffer, OwnDictBuffer])
+def test_dict_observations(buffer_class, limit, monkeypatch):
+    monkeypatch.setattr(reference_batches, "HELD_AT_MOST", limit)
+    env = RandomEnv(observation_space=DICT)
+    models = [
+        CChainPPO(
+            "MultiInputPolicy", env, rollout_buffer_class=each, n_steps=36, batch_size=8, n_epochs=2, seed=0, device="cpu"
+        )
+        for each in (None, buffer_class)
+    ]
+    for model in models:
+        model.set_random_seed(0)
+        model.learn(72, log_interval=10**6)
+        assert_churn_was_reduced(model)
+    assert_equal(*models)
 
 
 # --- How they go through the policy ------------------------------------------------------------------------------------------

@@ -1,21 +1,21 @@
 """Reference batches for PPO: samples of the same rollout, outside the minibatch whose update they measure."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.networks.policy_inputs import rows
+from sb3_cchain.networks.policy_inputs import joined, n_observations, rows
 from sb3_cchain.replaced import replaced
 
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
 
-# Rollouts whose observations take at most this many bytes are gathered once per epoch, instead of once per minibatch; that is
-# another copy of the rollout
-GATHERED_AT_ONCE = 2**24
+# Rollouts whose observations take at most this many bytes are gathered once per epoch, which holds them twice. Larger ones are
+# gathered minibatch by minibatch
+HELD_AT_MOST = 2**24
 
 
 class ReferenceBatches:
@@ -49,59 +49,93 @@ class ReferenceBatches:
         :param batch_size: Minibatch size
         :return: The minibatches of one epoch
         """
-        minibatches = self._minibatch_indices(batch_size)
-        epoch = np.concatenate(minibatches)
-        samples = self._samples_at(epoch)
-        full_size = len(minibatches[0])
-        half_an_epoch = (len(minibatches) + 1) // 2 * full_size
+        epoch = self._draw_epoch(batch_size)
+        n_samples, n_minibatches, full_size = sum(epoch.sizes), len(epoch.sizes), epoch.sizes[0]
+        half_an_epoch = (n_minibatches + 1) // 2 * full_size
         end = n_in_next = 0
-        for position, indices in enumerate(minibatches):
-            end += len(indices)
-            n_outside = len(epoch) - len(indices)
-            size = min(max(round(self._size * full_size), 1), n_outside or len(epoch))
+        for position, minibatch_size in enumerate(epoch.sizes):
+            end += minibatch_size
+            n_outside = n_samples - minibatch_size
+            size = min(max(round(self._size * full_size), 1), n_outside or n_samples)
             self.n_shared, n_in_next = n_in_next, 0
             start = end
             if self._kind == "independent":
-                start += max(min(half_an_epoch - len(indices), n_outside - size), 0)
-            elif position + 1 < len(minibatches):
-                n_in_next = min(size, len(minibatches[position + 1]))
-            self.current = samples(start % len(epoch), size).observations
+                start += max(min(half_an_epoch - minibatch_size, n_outside - size), 0)
+            elif position + 1 < n_minibatches:
+                n_in_next = min(size, epoch.sizes[position + 1])
+            self.current = epoch.observations(start % n_samples, size)
             self.starts_epoch = position == 0
-            yield samples(end - len(indices), len(indices))
+            yield epoch.minibatch(position)
 
-    def _minibatch_indices(self, batch_size: int | None) -> list[np.ndarray]:
-        minibatches: list[Any]
+    def _draw_epoch(self, batch_size: int | None) -> "_HeldEpoch | _GatheredEpoch":
+        if getattr(self._get, "__func__", None) not in (RolloutBuffer.get, DictRolloutBuffer.get):
+            minibatches = list(self._get(batch_size))  # the buffer may make them in its own way
+            return _HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
         with replaced(self._buffer, "_get_samples", lambda indices, env=None: indices):
-            minibatches = list(self._get(batch_size))
-        if not all(isinstance(indices, np.ndarray) for indices in minibatches):
-            raise TypeError(
-                f"{type(self._buffer).__name__}.get() must gather its minibatches by `_get_samples(indices)`, as "
-                "SB3's rollout buffers do"
-            )
-        return minibatches
-
-    def _samples_at(self, epoch: np.ndarray) -> Callable[[int, int], Any]:
-        """
-        :param epoch: Indices of all samples in the order of the epoch
-        :return: What gives so many samples from a position in it on; the first follow the last
-        """
-        gather = self._buffer._get_samples
-
-        def from_buffer(start: int, size: int) -> Any:
-            return gather(epoch.take(range(start, start + size), mode="wrap"))
-
-        if self._n_bytes() > GATHERED_AT_ONCE:
-            return from_buffer
-        # Gathering all at once takes less time
-        everything = from_buffer(0, len(epoch))
-
-        def from_epoch(start: int, size: int) -> Any:
-            if start + size > len(epoch):
-                return from_buffer(start, size)
-            return type(everything)(*(rows(part, slice(start, start + size)) for part in everything))
-
-        return from_epoch
+            epoch = _GatheredEpoch(self._buffer, list(self._get(batch_size)))
+        return epoch.held() if self._n_bytes() <= HELD_AT_MOST else epoch
 
     def _n_bytes(self) -> int:
         observations = self._buffer.observations
         return sum(array.nbytes for array in (observations.values() if isinstance(observations, dict) else [observations]))
+
+
+class _HeldEpoch:
+    """
+    :param minibatches: The minibatches
+    :param observations: The observations of all of them, one after the other
+    """
+
+    def __init__(self, minibatches: list[Any], observations: PyTorchObs):
+        self.sizes = [n_observations(minibatch.observations) for minibatch in minibatches]
+        self._minibatches = minibatches
+        self._observations = observations
+
+    def minibatch(self, position: int) -> Any:
+        return self._minibatches[position]
+
+    def observations(self, start: int, size: int) -> PyTorchObs:
+        """
+        :param start: Position in the epoch
+        :param size: Number of samples from there; the epoch's first follow its last
+        :return: Their observations
+        """
+        beyond = max(start + size - n_observations(self._observations), 0)
+        samples = rows(self._observations, slice(start, start + size - beyond))
+        return joined(samples, rows(self._observations, slice(beyond))) if beyond else samples
+
+
+class _GatheredEpoch:
+    """
+    Gathers samples when their turn comes, so that images are not held twice.
+
+    :param buffer: A rollout buffer of SB3
+    :param indices: Of each minibatch, where its samples are in the buffer
+    """
+
+    def __init__(self, buffer: RolloutBuffer, indices: list[Any]):
+        self.sizes = [len(minibatch) for minibatch in indices]
+        self._buffer = buffer
+        self._indices = indices
+        self._epoch = np.concatenate(indices)
+
+    def minibatch(self, position: int) -> Any:
+        return self._buffer._get_samples(self._indices[position])
+
+    def observations(self, start: int, size: int) -> PyTorchObs:
+        """
+        :param start: Position in the epoch
+        :param size: Number of samples from there; the epoch's first follow its last
+        :return: Their observations
+        """
+        return self._buffer._get_samples(self._epoch.take(range(start, start + size), mode="wrap")).observations
+
+    def held(self) -> _HeldEpoch:
+        """
+        :return: The same epoch, gathered at once, which takes less time
+        """
+        everything = self._buffer._get_samples(self._epoch)
+        ends = np.cumsum(self.sizes).tolist()
+        parts = [slice(end - size, end) for end, size in zip(ends, self.sizes, strict=True)]
+        minibatches = [type(everything)(*(rows(each, part) for each in everything)) for part in parts]  # type: ignore[arg-type]
+        return _HeldEpoch(minibatches, everything.observations)

@@ -14,16 +14,15 @@ def n_observations(observations: PyTorchObs) -> int:
     return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
 
 
-def joined(first: PyTorchObs, second: PyTorchObs) -> PyTorchObs:
+def joined(*batches: PyTorchObs) -> PyTorchObs:
     """
-    :param first: Batch of observations
-    :param second: Another one
-    :return: Both as one batch
+    :param batches: Batches of observations
+    :return: One batch of all of them
     """
-    if isinstance(first, dict) and isinstance(second, dict):
-        return {key: th.cat([first[key], second[key]]) for key in first}
-    assert th.is_tensor(first) and th.is_tensor(second)
-    return th.cat([first, second])
+    first = batches[0]
+    if isinstance(first, dict):
+        return {key: th.cat([batch[key] for batch in batches]) for key in first}  # type: ignore[index]
+    return th.cat(batches)  # type: ignore[arg-type]
 
 
 def rows(observations: PyTorchObs, chosen: slice) -> PyTorchObs:
