@@ -5,6 +5,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_cchain.algorithms.finite_check import FiniteCheck
 from tests.churn_models import BOX, IMAGE, each_form
 from tests.envs import RandomEnv
 
@@ -98,3 +99,10 @@ def test_names_the_id(form):
 @pytest.mark.parametrize("reward", [1e12, -1e12])
 def test_large_values_are_allowed(form, reward):
     assert learn(form, vectorise(FaultyEnv("reward", 7, reward))).num_timesteps == 64
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_finite_values_whose_squares_are_infinite_are_allowed(dtype):
+    values = np.full((2, 3), np.finfo(dtype).max)
+    with np.errstate(all="raise"):
+        FiniteCheck()._check("observation", values)

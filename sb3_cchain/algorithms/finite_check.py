@@ -1,5 +1,6 @@
 """Stops training at the first NaN or infinite value that an environment gives, before an update is made on it."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ class FiniteCheck(BaseCallback):
     def _on_step(self) -> bool:
         self._check("reward", self.locals["rewards"])
         self._check_observations(self.locals["new_obs"])
-        if self.locals["dones"].any():
+        if np.count_nonzero(self.locals["dones"]):
             for index, info in enumerate(self.locals["infos"]):
                 if "terminal_observation" in info:
                     self._check_observations(info["terminal_observation"], index)
@@ -38,7 +39,9 @@ class FiniteCheck(BaseCallback):
     def _check(self, kind: str, values: Any, index: int | None = None) -> None:
         """``values`` are those of all environments, or of the one at ``index``."""
         values = np.asarray(values)
-        if values.dtype.kind != "f" or np.isfinite(values).all():
+        # If one of the values is NaN or infinite, so is their sum of squares, which is the fastest to compute. The sum may also
+        # be too large for finite values.
+        if values.dtype.kind != "f" or math.isfinite(np.vdot(values, values)) or np.isfinite(values).all():
             return
         bad = ~np.isfinite(values)
         if index is None:

@@ -110,7 +110,7 @@ class ContinualMetrics(BaseCallback):
         elif self._state["task_id"] is None:
             self._begin_task(task_id)
         self._count_rewards(infos)
-        if dones.any():
+        if np.count_nonzero(dones):
             self._count_episodes(infos, dones)
         return True
 
@@ -122,7 +122,7 @@ class ContinualMetrics(BaseCallback):
 
     def _count_rewards(self, infos: list[dict[str, Any]]) -> None:
         if "task_reward" in infos[0]:
-            reward = sum(info["task_reward"] for info in infos)
+            reward = sum([info["task_reward"] for info in infos])
         else:
             normalize = self._vec_normalize
             rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()

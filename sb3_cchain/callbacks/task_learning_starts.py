@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -54,7 +55,7 @@ class TaskLearningStarts(BaseCallback):
         if self._switch.task_id is None:
             self._listen(step_task(self.model, self.locals["infos"]))
         # A switch ends an episode
-        if self.locals["dones"].any():
+        if np.count_nonzero(self.locals["dones"]):
             self._listen(episode_task(self.model))
         return True
 

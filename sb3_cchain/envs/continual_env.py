@@ -144,8 +144,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         self.clock.advance()
         self._episode_return += float(reward)
         truncated = truncated or self.clock.is_over
-        told = {"task_id": self.task_id, "task_reward": float(reward), "episode_return": self._episode_return}
-        return observation, reward, terminated, truncated, {**info, **told}
+        info = {**info, "task_id": self.task_id, "task_reward": float(reward), "episode_return": self._episode_return}
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:
         """

@@ -144,6 +144,8 @@ class TaskVecNormalize(VecNormalize):
             self.obs_rms.update(observation)
 
     def _normalize_terminal(self, dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> None:
+        if not np.count_nonzero(dones):
+            return
         for position in np.flatnonzero(dones):
             info = infos[position]
             if "terminal_observation" in info:
