@@ -1,11 +1,13 @@
 """NaN and infinite values from an environment are named before the network is trained on them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cchain.algorithms.finite_check import FiniteCheck
+from sb3_cchain.algorithms.finite_check import FEW_VALUES, FiniteCheck
 from tests.churn_models import BOX, IMAGE, each_form
 from tests.envs import RandomEnv
 
@@ -101,8 +103,19 @@ def test_large_values_are_allowed(form, reward):
     assert learn(form, vectorise(FaultyEnv("reward", 7, reward))).num_timesteps == 64
 
 
+@pytest.mark.parametrize("n_values", [2, FEW_VALUES, FEW_VALUES + 1])
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_finite_values_whose_squares_are_infinite_are_allowed(dtype):
-    values = np.full((2, 3), np.finfo(dtype).max)
-    with np.errstate(all="raise"):
-        FiniteCheck()._check("observation", values)
+def test_few_and_many_values(dtype, n_values):
+    check = FiniteCheck()
+    check.model = SimpleNamespace(get_env=lambda: vectorise(FaultyEnv()))
+    values = np.full((1, n_values), np.finfo(dtype).max)  # whose sum is infinite
+    check.locals = {"rewards": np.array([1.0], dtype), "new_obs": values, "dones": np.array([False])}
+    assert check._on_step()
+    for bad in ([np.nan], [np.inf], [-np.inf], [np.inf, -np.inf]):
+        values[0, -len(bad) :] = bad
+        with pytest.raises(ValueError, match=rf"NaN or infinite observation .* it holds {bad[0]}"):
+            check._on_step()
+    values[:] = 0
+    check.locals["rewards"][0] = np.nan
+    with pytest.raises(ValueError, match=r"NaN or infinite reward .* it holds nan"):
+        check._on_step()

@@ -8,9 +8,6 @@ the rest of the same training. Two trainings, with and without, differ by more t
 
 import argparse
 import resource
-import time
-from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import torch as th
@@ -23,6 +20,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 
 from benchmarks.speed.cases import model_settings
+from benchmarks.speed.time_inside import TimeInside
+from benchmarks.speed.timing import seconds
 from sb3_cchain import ChurnMonitor
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
@@ -41,26 +40,11 @@ def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: Base
     :param n_steps: Environment steps to train for
     :return: Seconds of processor time in the callback, and in the rest of the training
     """
-    inside = 0.0
-
-    def timed(method: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(method)
-        def call(*args: Any) -> Any:
-            nonlocal inside
-            start = time.process_time()
-            result = method(*args)
-            inside += time.process_time() - start
-            return result
-
-        return call
-
-    for name in ENTRANCES:
-        if hasattr(monitor, name):
-            setattr(monitor, name, timed(getattr(monitor, name)))
+    inside = TimeInside()
+    inside.watch(monitor, *(name for name in ENTRANCES if hasattr(monitor, name)))
     model = algorithm(**settings)
-    start = time.process_time()
-    model.learn(n_steps, callback=monitor)
-    return inside, time.process_time() - start - inside
+    total = seconds(lambda: model.learn(n_steps, callback=monitor))
+    return inside.seconds, total - inside.seconds
 
 
 def impala() -> str:
@@ -69,9 +53,9 @@ def impala() -> str:
     """
     env = make_vec_env(FakeImageEnv, 64, seed=0, env_kwargs=dict(screen_height=64, screen_width=64, n_channels=3))
     settings = dict(policy=ImpalaPolicy, env=env, n_steps=256, batch_size=1024, n_epochs=1, seed=0, device="cpu")
-    seconds, _ = cost(PPO, settings, NTKCallback(), 64 * 256)
+    inside, _ = cost(PPO, settings, NTKCallback(), 64 * 256)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    return f"The NTK of the IMPALA network: {seconds:.0f} s of processor time; the process needed {memory:.1f} GB at most."
+    return f"The NTK of the IMPALA network: {inside:.0f} s of processor time; the process needed {memory:.1f} GB at most."
 
 
 def main() -> None:

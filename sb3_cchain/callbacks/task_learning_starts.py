@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -55,7 +54,7 @@ class TaskLearningStarts(BaseCallback):
         if self._switch.task_id is None:
             self._listen(step_task(self.model, self.locals["infos"]))
         # A switch ends an episode
-        if np.count_nonzero(self.locals["dones"]):
+        if any(self.locals["dones"].tolist()):
             self._listen(episode_task(self.model))
         return True
 

@@ -140,11 +140,12 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :param action: The action
         :return: Observation, reward, terminated, truncated, info
         """
-        observation, reward, terminated, truncated, info = self.task.step(action)
-        self.clock.advance()
-        self._episode_return += float(reward)
-        truncated = truncated or self.clock.is_over
-        info = {**info, "task_id": self.task_id, "task_reward": float(reward), "episode_return": self._episode_return}
+        task_id = self.clock.task_id
+        observation, reward, terminated, truncated, info = self.tasks[task_id].step(action)
+        truncated = self.clock.advance() or truncated
+        task_reward = float(reward)
+        self._episode_return += task_reward
+        info = {**info, "task_id": task_id, "task_reward": task_reward, "episode_return": self._episode_return}
         return observation, reward, terminated, truncated, info
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:

@@ -110,8 +110,7 @@ class ContinualProcgenVecEnv(VecEnv):
         observations = all_observations["rgb"]
         self._returns += rewards
         task_id = self._sequence.task_id
-        self._sequence.clock.advance()
-        switch = self._sequence.clock.is_over
+        switch = self._sequence.clock.advance()
         dones = np.logical_or(terminated, switch)
         infos: list[dict[str, Any]] = [
             {

@@ -144,7 +144,7 @@ class TaskVecNormalize(VecNormalize):
             self.obs_rms.update(observation)
 
     def _normalize_terminal(self, dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> None:
-        if not np.count_nonzero(dones):
+        if not any(dones.tolist()):
             return
         for position in np.flatnonzero(dones):
             info = infos[position]

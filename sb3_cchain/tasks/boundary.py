@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
@@ -45,7 +44,7 @@ class TaskBoundary(BaseCallback):
 
     def _on_step(self) -> bool:
         # A switch ends an episode
-        self._may_have_switched |= bool(np.count_nonzero(self.locals["dones"]))
+        self._may_have_switched |= any(self.locals["dones"].tolist())
         return True
 
     @abstractmethod

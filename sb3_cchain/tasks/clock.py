@@ -43,7 +43,7 @@ class TaskClock:
     @property
     def is_over(self) -> bool:
         """Whether the present task's time is over. It never is when the clock is pinned to a task."""
-        return self._pinned_task is None and self.due_task != self.task_id
+        return self._pinned_task is None and bisect_right(self._ends, self._total_steps) != self.task_id
 
     def set(self, total_steps: int, n_envs: int | None = None) -> None:
         """
@@ -70,9 +70,14 @@ class TaskClock:
         check_number("task_id", task_id, 0, self.n_tasks - 1, integer=True)
         self._pinned_task = int(task_id)
 
-    def advance(self) -> None:
-        """Count one step of each environment."""
+    def advance(self) -> bool:
+        """
+        Count one step of each environment.
+
+        :return: Whether the present task's time is over
+        """
         self._total_steps += self.n_envs
+        return self.is_over
 
     def begin(self) -> bool:
         """

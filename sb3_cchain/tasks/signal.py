@@ -8,7 +8,7 @@ present task, as :func:`step_task` or :func:`episode_task` tell it. Both ask the
 2. The model's ``set_env()``: where the environment gives no number, the next task begins when the model is trained in another
    environment than before. An environment that comes again is a new task, too.
 
-Another source of switches (a call by the user, a test that detects them) belongs here, in ``_task``.
+Another source of switches (a call by the user, a test that detects them) belongs here, in ``step_task``.
 """
 
 from typing import Any
@@ -46,7 +46,8 @@ def step_task(model: BaseAlgorithm, infos: list[dict[str, Any]]) -> Any:
     :param infos: The infos of a step
     :return: The task that the step was made in. It tells of a switch one step after the switch.
     """
-    return _task(model, infos[0])
+    info = infos[0]
+    return info["task_id"] if "task_id" in info else _env_number(model)
 
 
 def episode_task(model: BaseAlgorithm) -> Any:
@@ -56,7 +57,7 @@ def episode_task(model: BaseAlgorithm) -> Any:
         episode, and the vectorised environment has already begun the next episode.
     """
     assert model.env is not None
-    return _task(model, first_reset_info(model.env))
+    return step_task(model, [first_reset_info(model.env)])
 
 
 def first_reset_info(env: VecEnv) -> dict[str, Any]:
@@ -65,10 +66,6 @@ def first_reset_info(env: VecEnv) -> dict[str, Any]:
     :return: The info with which the present episode of its first environment began; environments side by side switch together
     """
     return env.unwrapped.reset_infos[0]
-
-
-def _task(model: BaseAlgorithm, info: dict[str, Any]) -> Any:
-    return info["task_id"] if "task_id" in info else _env_number(model)
 
 
 # The environment that each model was last trained in. It is not saved with the model: where training is resumed, the same

@@ -46,9 +46,10 @@ class TaskSync(BaseCallback):
         evaluate_on(self._switch.task_id, eval_envs)
 
     def _on_step(self) -> bool:
-        task_id = step_task(self.model, self.locals["infos"])
-        if self._switch.happened(task_id):
-            evaluate_on(task_id, self._eval_envs)
+        if self._eval_envs:
+            task_id = step_task(self.model, self.locals["infos"])
+            if self._switch.happened(task_id):
+                evaluate_on(task_id, self._eval_envs)
         return True
 
 
