@@ -194,12 +194,12 @@ def main() -> None:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", nargs="+", default=list(CASES), choices=list(CASES), help="What to time")
-    parser.add_argument("--rounds", type=int, default=8, help="Timings of each")
+    parser.add_argument("--rounds", type=int, default=6, help="Timings of each")
     args = parser.parse_args()
     th.set_num_threads(1)
     for name in args.case:
         model, bare, n_steps = CASES[name]()
-        title = f"{type(model).__name__}, {name}, {args.rounds} rounds"
+        title = f"{type(model).__name__}, {name}, rounds: {args.rounds}"
         Console().print(as_table(title, time_in_turn((model, bare), n_steps, args.rounds), n_steps))
 
 
