@@ -89,8 +89,10 @@ class ChurnAlgorithm(BaseAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
         self._is_first_training = True
-        if not isinstance(callback, (BaseCallback, list)):
-            callback = ConvertCallback(callback)  # a function, or None
+        if callback is None:
+            callback = []  # SB3's stand-in for no callback would be called at each step
+        elif not isinstance(callback, (BaseCallback, list)):
+            callback = ConvertCallback(callback)  # a function
         given = callback if isinstance(callback, list) else [callback]
         return super()._init_callback(with_continual_callbacks([*given, FiniteCheck()], self.env), progress_bar)
 

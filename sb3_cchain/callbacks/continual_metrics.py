@@ -170,24 +170,24 @@ class ContinualMetrics(BaseCallback):
         return new
 
     def _on_rollout_end(self) -> None:
-        new, present_task = self._take_rows(), self._state["task_id"]
-        self.logger.record("continual/task_id", present_task)
-        self.logger.record("continual/n_switches", self._state["n_switches"])
+        new, present_task, logger = self._take_rows(), self._state["task_id"], self.logger
+        logger.record("continual/task_id", present_task)
+        logger.record("continual/n_switches", self._state["n_switches"])
         if self._rollout_steps > 0:
-            self.logger.record_mean("continual/reward_per_step", self._rollout_reward / self._rollout_steps)
+            logger.record_mean("continual/reward_per_step", self._rollout_reward / self._rollout_steps)
             self._rollout_reward, self._rollout_steps = 0.0, 0
         for row in new:
             task_id = int(row["task_id"])
             self._n_rows[task_id] += 1
             average = self._averages.get(task_id, 0.0)
             self._averages[task_id] = average + (row["mean_return"] - average) / self._n_rows[task_id]
-            self.logger.record(f"continual/average_task_{task_id}", self._averages[task_id])
+            logger.record(f"continual/average_task_{task_id}", self._averages[task_id])
             if task_id == present_task:
-                self.logger.record_mean("continual/mean_return", row["mean_return"])
+                logger.record_mean("continual/mean_return", row["mean_return"])
         if new:
             self._average_performance = float(np.mean(list(self._averages.values())))
         if self._averages:
-            self.logger.record("continual/average_performance", self._average_performance)
+            logger.record("continual/average_performance", self._average_performance)
 
     def _on_training_end(self) -> None:
         state = self._state
