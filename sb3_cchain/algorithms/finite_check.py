@@ -26,8 +26,9 @@ class FiniteCheck(BaseCallback):
 
     def _on_step(self) -> bool:
         rewards, observations = self.locals["rewards"], self.locals["new_obs"]
-        if not _surely_finite(rewards, observations):
+        if not _surely_finite(rewards):
             self._check("reward", rewards)
+        if isinstance(observations, dict) or not _surely_finite(observations):
             self._check_observations(observations)
         if any(self.locals["dones"].tolist()):
             for index, info in enumerate(self.locals["infos"]):
@@ -57,13 +58,11 @@ class FiniteCheck(BaseCallback):
         )
 
 
-def _surely_finite(rewards: NDArray, observations: Any) -> bool:
-    """What most steps need: a sum is NaN or infinite if a value is. It may also be too large for finite values."""
-    return (
-        isinstance(observations, np.ndarray)
-        and observations.size <= FEW_VALUES
-        and math.isfinite(sum(rewards.tolist()) + sum(observations.ravel().tolist()))
-    )
+def _surely_finite(values: NDArray) -> bool:
+    """All that most steps need: a sum is NaN or infinite if a value is. It may also be too large for finite values."""
+    if values.dtype.kind != "f":
+        return True
+    return values.size <= FEW_VALUES and math.isfinite(sum(values.ravel().tolist()))
 
 
 def _id(env: VecEnv, index: int) -> str:
