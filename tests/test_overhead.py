@@ -48,7 +48,7 @@ def test_both_trainings_make_the_same_steps_and_updates(algorithm, bare, setting
     assert len(models[0].continual_returns) > 1 and not hasattr(models[1], "continual_returns")
     for timing in (timing for pair in timings for timing in pair):
         assert 0 < sum(timing[part] for part in PARTS) < timing["all but train()"] < timing["all"]
-        assert timing["environment"] > 0 and timing["callbacks"] > 0
+        assert timing["around the simulation"] > 0 and timing["callbacks"] > 0
 
 
 def test_first_task_keeps_the_limit_of_steps():
@@ -61,13 +61,13 @@ def test_first_task_keeps_the_limit_of_steps():
 def test_table_by_hand():
     zero = dict.fromkeys(PARTS, 0.0)
 
-    def timing(environment, everything):
-        return {**zero, "environment": environment, "all but train()": everything / 2, "all": everything}
+    def timing(first_part, everything):
+        return {**zero, PARTS[0]: first_part, "all but train()": everything / 2, "all": everything}
 
     table = as_table("title", [(timing(3, 30), timing(1, 20)), (timing(2, 22), timing(2, 40))], 1_000_000)
     rows = list(zip(*(column.cells for column in table.columns), strict=True))
     assert [row[0] for row in rows] == [*PARTS, "these parts", "all but train()"]
-    assert rows[0] == ("environment", "2.5", "1.5", "5.00%", "0.00%", "10.00%")
+    assert rows[0] == (PARTS[0], "2.5", "1.5", "5.00%", "0.00%", "10.00%")
     assert rows[1] == (PARTS[1], "0.0", "0.0", "0.00%", "0.00%", "0.00%")
     assert rows[-2][1:] == rows[0][1:]
     assert rows[-1] == ("all but train()", "13.0", "15.0", "1.25%", "-22.50%", "25.00%")

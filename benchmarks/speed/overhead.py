@@ -28,18 +28,18 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.speed.cases import model_settings
 from benchmarks.speed.time_inside import TimeInside
 from benchmarks.speed.timing import seconds
-from sb3_cchain import CChainDQN, CChainPPO
+from sb3_cchain import CChainDQN, CChainPPO, ContinualEnv
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.envs import TaskVecNormalize
 
 # What is timed of a training, by the names in the table. The start and the end of `learn()` are left out: they come once in a
 # training, but in each round here.
-PARTS = ("environment", "callbacks", "buffers of episodes", "logger")
+PARTS = ("around the simulation", "callbacks", "buffers of episodes", "logger")
 EVENTS = ("update_locals", "on_step", "on_rollout_start", "on_rollout_end")
 
 Seconds = dict[str, float]
@@ -74,6 +74,15 @@ def first_task(env_id: str) -> gym.Env:
     return task if limit is None else TimeLimit(task, limit)
 
 
+def simulation(env: VecEnv) -> gym.Env:
+    """
+    :param env: A vectorised environment, of a continual environment or of its first task
+    :return: The environment that makes the steps, without anything around it
+    """
+    inner = env.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
+    return inner.task.unwrapped if isinstance(inner, ContinualEnv) else inner
+
+
 class TimedTraining:
     """
     A training whose parts are timed.
@@ -85,8 +94,9 @@ class TimedTraining:
     def __init__(self, model: Any, folder: str):
         self.model = model
         model.set_logger(configure(folder, ["tensorboard"]))
-        self._inside = {name: TimeInside() for name in (*PARTS, "train()", "start and end")}
-        self._inside["environment"].watch(model.env, "step")
+        self._inside = {name: TimeInside() for name in (*PARTS, "simulation", "train()", "start and end")}
+        self._inside["around the simulation"].watch(model.env, "step")
+        self._inside["simulation"].watch(simulation(model.env), "step")
         self._inside["buffers of episodes"].watch(model, "_update_info_buffer")
         self._inside["logger"].watch(model.logger, "dump")
         self._inside["train()"].watch(model, "train")
@@ -112,6 +122,7 @@ class TimedTraining:
         set_random_seed(seed)
         total = seconds(lambda: self.model.learn(n_steps, reset_num_timesteps=False))
         timing = {name: inside.seconds for name, inside in self._inside.items()}
+        timing["around the simulation"] -= timing.pop("simulation")
         timing["all"] = total - timing.pop("start and end")
         timing["all but train()"] = timing["all"] - timing["train()"]
         return timing
