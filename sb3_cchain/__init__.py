@@ -2,7 +2,7 @@
 
 import sb3_cchain.gym_notice  # noqa: F401  # isort: skip  # before Stable-Baselines3
 
-from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN, FiniteCheck
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.envs import ContinualEnv, register_envs
@@ -19,6 +19,7 @@ __all__ = [
     "ContinualEnv",
     "ContinualMetrics",
     "DoubleDQN",
+    "FiniteCheck",
     "TaskSync",
     "TensorBoardOverview",
     "make_lean",

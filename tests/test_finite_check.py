@@ -1,14 +1,18 @@
-"""NaN and infinite values from an environment are named before the network is trained on them."""
+"""NaN and infinite values are named before the network is trained on them."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cchain.algorithms.finite_check import FEW_VALUES, FiniteCheck
-from tests.churn_models import BOX, IMAGE, each_form
+from sb3_cchain import CChainCallback, CChainPPO, FiniteCheck, make_lean
+from sb3_cchain.algorithms.finite_check import FEW_VALUES
+from tests.churn_models import ACTION_SPACES, BOX, IMAGE, PPO_SETTINGS, each_form
 from tests.envs import RandomEnv
 
 DICT = spaces.Dict({"image": IMAGE, "a": spaces.Box(-1, 1, (2,), np.float64)})
@@ -119,3 +123,72 @@ def test_few_and_many_values(dtype, n_values):
     check.locals["rewards"][0] = np.nan
     with pytest.raises(ValueError, match=r"NaN or infinite reward .* it holds nan"):
         check._on_step()
+
+
+# --- What the policy gives -----------------------------------------------------------------------------------------------
+
+
+class SpoilOnce(BaseCallback):
+    """Puts a value into a parameter after so many rollouts, as an update might."""
+
+    def __init__(self, value, parameter="action_net.weight", n_rollouts=2):
+        super().__init__()
+        self.value, self.parameter, self.n_left = value, parameter, n_rollouts
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.n_left -= 1
+        if self.n_left == 0:
+            train = self.model.train
+
+            def train_and_spoil():
+                train()
+                with th.no_grad():
+                    dict(self.model.policy.named_parameters())[self.parameter].flatten()[0] = self.value
+
+            self.model.train = train_and_spoil
+
+
+POLICY_FORMS = {
+    "CChainPPO": (lambda env: CChainPPO("MlpPolicy", env, **PPO_SETTINGS), []),
+    "CChainCallback": (lambda env: PPO("MlpPolicy", env, **PPO_SETTINGS), [CChainCallback]),
+    "lean PPO": (lambda env: make_lean(PPO("MlpPolicy", env, **PPO_SETTINGS)), [FiniteCheck]),
+    "lean A2C": (lambda env: make_lean(A2C("MlpPolicy", env, device="cpu", n_steps=32)), [FiniteCheck]),
+}
+each_policy_form = pytest.mark.parametrize("make, callbacks", POLICY_FORMS.values(), ids=POLICY_FORMS)
+each_action_space = pytest.mark.parametrize("action_space", ACTION_SPACES, ids=lambda space: type(space).__name__)
+
+
+@each_policy_form
+@each_action_space
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_names_the_parameter(make, callbacks, action_space, value):
+    model = make(RandomEnv(action_space=action_space))
+    with pytest.raises(ValueError, match=r"parameter action_net.weight holds NaN or infinite values at step 64 of training"):
+        model.learn(32 * 4, [SpoilOnce(value), *(callback() for callback in callbacks)])
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@each_policy_form
+def test_outputs_that_are_too_large(make, callbacks):
+    """Of finite parameters."""
+    model = make(RandomEnv())
+    with th.no_grad():
+        model.policy.value_net.weight[:] = 3e38
+    with pytest.raises(
+        ValueError, match=r"The policy gave NaN or infinite values in the rollout that ended at step 32 of training"
+    ):
+        model.learn(32, [callback() for callback in callbacks])
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@each_action_space
+def test_prediction_of_a_policy_with_nan(action_space, deterministic):
+    """SB3's kind of error, too."""
+    model = make_lean(PPO("MlpPolicy", RandomEnv(action_space=action_space), **PPO_SETTINGS))
+    with th.no_grad():
+        model.policy.action_net.weight[:] = np.nan
+    with pytest.raises(ValueError, match="outputs of the policy network are NaN"):
+        model.predict(np.ones(4, np.float32), deterministic=deterministic)

@@ -107,19 +107,21 @@ def assert_same_training(lean, stock):
     assert logged[0] == logged[1]
 
 
-@each_space
+TRAININGS = {
+    "PPO": (PPO, "MlpPolicy", dict(batch_size=8, n_epochs=2)),
+    "A2C": (A2C, "MlpPolicy", {}),
+    "RecurrentPPO": (RecurrentPPO, "MlpLstmPolicy", dict(batch_size=8, n_epochs=2)),
+}
+
+
 @pytest.mark.parametrize(
-    "algorithm, policy, settings",
-    [
-        (PPO, "MlpPolicy", dict(batch_size=8, n_epochs=2)),
-        (A2C, "MlpPolicy", {}),
-        (RecurrentPPO, "MlpLstmPolicy", dict(batch_size=8, n_epochs=2)),
-    ],
-    ids=["PPO", "A2C", "RecurrentPPO"],
+    "name, action_space",
+    # RecurrentPPO itself cannot train on MultiBinary actions
+    [(name, space) for name in TRAININGS for space in SPACES if (name, type(space)) != ("RecurrentPPO", spaces.MultiBinary)],
+    ids=str,
 )
-def test_same_training(action_space, algorithm, policy, settings):
-    if algorithm is RecurrentPPO and isinstance(action_space, spaces.MultiBinary):
-        pytest.skip("RecurrentPPO cannot train on MultiBinary actions")
+def test_same_training(name, action_space):
+    algorithm, policy, settings = TRAININGS[name]
     settings = dict(n_steps=32, ent_coef=0.01, seed=0, device="cpu", **settings)
     stock = algorithm(policy, RandomEnv(action_space=action_space), **settings).learn(96, log_interval=10**6)
     lean = make_lean(algorithm(policy, RandomEnv(action_space=action_space), **settings))

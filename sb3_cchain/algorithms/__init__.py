@@ -3,6 +3,7 @@
 from sb3_cchain.algorithms.cchain_callback import CChainCallback
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
 from sb3_cchain.algorithms.dqn_cchain import CChainDQN
+from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.ppo_cchain import CChainPPO
 
 __all__ = [
@@ -10,4 +11,5 @@ __all__ = [
     "CChainDQN",
     "CChainPPO",
     "DoubleDQN",
+    "FiniteCheck",
 ]

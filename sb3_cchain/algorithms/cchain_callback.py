@@ -119,6 +119,7 @@ class CChainCallback(FiniteCheck):
         return True
 
     def _on_rollout_end(self) -> None:
+        super()._on_rollout_end()
         if self.churn_reducer.coefficient.is_zero:
             return
         train, not_saved = self.model.train, [*self.model._excluded_save_params(), "train", "_excluded_save_params"]

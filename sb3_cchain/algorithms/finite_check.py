@@ -1,4 +1,4 @@
-"""Stops training at the first NaN or infinite value that an environment gives, before an update is made on it."""
+"""Stops training at NaN and infinite values, of the environment or of an actor-critic policy, and says where they are."""
 
 import math
 from typing import Any
@@ -6,7 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cchain.networks.compiled import uncompiled
 
 # Up to about as many values of a step, adding Python's numbers takes less time than NumPy's functions
 FEW_VALUES = 100
@@ -14,12 +17,15 @@ FEW_VALUES = 100
 
 class FiniteCheck(BaseCallback):
     """
-    Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked.
+    Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked. Of
+    an on-policy algorithm it checks the parameters of the policy before each rollout, and what the policy gave after it.
 
-    Torch would raise an error, too, but later, and one that names neither the environment nor the step.
+    Torch would raise an error, too, but later, and one that names neither the environment nor the step nor the parameter.
     """
 
     def _on_rollout_start(self) -> None:
+        if isinstance(self.model, OnPolicyAlgorithm):
+            self._check_parameters()
         # These are those of the last step, which were checked, unless the environments have been reset
         if self.model._last_obs is not self.locals.get("new_obs"):
             self._check_observations(self.model._last_obs)
@@ -35,6 +41,27 @@ class FiniteCheck(BaseCallback):
                 if "terminal_observation" in info:
                     self._check_observations(info["terminal_observation"], index)
         return True
+
+    def _on_rollout_end(self) -> None:
+        if isinstance(self.model, OnPolicyAlgorithm):
+            for name in ("actions", "log_probs", "values"):
+                self._check_outputs(name, getattr(self.model.rollout_buffer, name))
+
+    def _check_parameters(self) -> None:
+        for name, parameter in uncompiled(self.model.policy).named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(
+                    f"The policy's parameter {name} holds NaN or infinite values at step {self.num_timesteps} of training. "
+                    "Lower the learning rate, set `max_grad_norm`, or scale the rewards."
+                )
+
+    def _check_outputs(self, name: str, outputs: np.ndarray) -> None:
+        if not np.isfinite(outputs).all():
+            raise ValueError(
+                f"The policy gave NaN or infinite {name} in the rollout that ended at step {self.num_timesteps} of training, "
+                "though its parameters are finite: they, or the observations, are too large. The network has not been trained "
+                "on this rollout. Normalise the observations, or lower the learning rate."
+            )
 
     def _check_observations(self, observations: Any, index: int | None = None) -> None:
         if isinstance(observations, dict):

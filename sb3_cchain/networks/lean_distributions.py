@@ -29,6 +29,18 @@ from sb3_cchain.networks.compiled import uncompiled
 OnPolicyModel = TypeVar("OnPolicyModel", bound=OnPolicyAlgorithm)
 
 
+NAN_OUTPUTS = (
+    "The outputs of the policy network are NaN or infinite. Look for NaN or infinite observations and parameters; "
+    "sb3_cchain.FiniteCheck names them in training."
+)
+
+
+def _without_nan(outputs: th.Tensor) -> th.Tensor:
+    if outputs.isnan().any():
+        raise ValueError(NAN_OUTPUTS)
+    return outputs
+
+
 class _Categorical:
     """What policies ask of torch's ``Categorical``, with its attributes' names: logits are ``(batch_size, n_actions)``."""
 
@@ -48,10 +60,13 @@ class _Categorical:
         return -(finite * self.probs).sum(-1)
 
     def sample(self) -> th.Tensor:
-        return th.multinomial(self.probs, 1, replacement=True).squeeze(-1)
+        try:
+            return th.multinomial(self.probs, 1, replacement=True).squeeze(-1)
+        except RuntimeError as error:
+            raise ValueError(NAN_OUTPUTS) from error
 
     def mode(self) -> th.Tensor:
-        return self.probs.argmax(dim=1)
+        return _without_nan(self.probs).argmax(dim=1)
 
 
 class LeanCategorical(CategoricalDistribution):
@@ -177,13 +192,16 @@ class LeanBernoulli(BernoulliDistribution):
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
-        return self._action_logits.detach().sigmoid().bernoulli()
+        try:
+            return self._action_logits.detach().sigmoid().bernoulli()
+        except RuntimeError as error:
+            raise ValueError(NAN_OUTPUTS) from error
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size, n_sub_actions)``
         """
-        return self._action_logits.sigmoid().round()
+        return _without_nan(self._action_logits.sigmoid()).round()
 
 
 class LeanDiagGaussian(DiagGaussianDistribution):
@@ -224,13 +242,13 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :return: Actions, ``(batch_size, action_dim)``, through which gradients flow
         """
         noise = th.empty(self._mean.shape, dtype=self._mean.dtype, device=self._mean.device).normal_()
-        return self._mean + noise * self._std
+        return _without_nan(self._mean) + noise * self._std
 
     def mode(self) -> th.Tensor:
         """
         :return: Means, ``(batch_size, action_dim)``
         """
-        return self._mean
+        return _without_nan(self._mean)
 
 
 # By the class of SB3's distribution, how to make the lean one from it
@@ -249,8 +267,8 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     Nothing changes for a policy that makes its distribution in its own way, and where the distribution is none of SB3's
     categorical, multi-categorical, Bernoulli and diagonal Gaussian ones (gSDE, the maskable ones of sb3-contrib).
 
-    The checks for NaN that torch's distributions make at every step are gone, too. A
-    :class:`~sb3_cchain.FiniteCheck` among the callbacks makes one per rollout.
+    An action is never drawn from NaN, as with torch's distributions. Where it came from is said by a
+    :class:`~sb3_cchain.FiniteCheck` among the callbacks, which looks at the policy once per rollout.
 
     :param model: A model of any on-policy algorithm
     :return: The same model
