@@ -1,12 +1,10 @@
-"""The commands ``demo``, ``compare`` and ``plasticity``, with a training command that starts at once; and ``speed``."""
+"""The commands ``demo``, ``compare`` and ``plasticity``, with a training command that starts at once."""
 
 import subprocess
 import sys
 from functools import partial
 
-import numpy as np
 import pytest
-from stable_baselines3 import PPO
 
 from benchmarks import compare, demo, plasticity
 from benchmarks.grid.executor import LocalBackend
@@ -14,9 +12,6 @@ from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, make_run
 from benchmarks.plasticity import LINES, variant_run
 from benchmarks.report.random_policy import look_at_task
-from benchmarks.speed import cases
-from benchmarks.speed.timing import n_operations, ratios
-from sb3_cchain.methods.registry import REGISTRY
 from tests.fake_training import fake_program
 
 LENGTH = ["--n-tasks", "2", "--steps-per-task", "800"]
@@ -132,34 +127,3 @@ def test_a_task_without_an_agent():
 
 def test_a_suite_that_shows_nothing_has_no_frame():
     assert look_at_task(make_run("gym_control", "Continual/CartPole-v1", "cchain", 0, 2, 100, "test"), 1, 1).frame is None
-
-
-def test_related_methods_are_timed_as_the_registry_has_them(monkeypatch):
-    """Each row of PPO, with its parts."""
-    trained = []
-    monkeypatch.setattr(PPO, "learn", lambda self, *arguments, **kwargs: trained.append(self))
-    case = cases.related()
-    rows = {row.label: row for row in REGISTRY if issubclass(row.algorithm, PPO)}
-    assert list(case.models) == list(rows) and len(trained) == len(rows) > 10
-    assert case.pairs == [(label, "PPO") for label in rows if label != "PPO"]
-    for label, (model, callbacks) in case.models.items():
-        row = rows[label]
-        assert type(model) is row.algorithm and [type(callback) for callback in callbacks] == list(row.callbacks)
-        assert row.optimizer_class is None or isinstance(model.policy.optimizer, row.optimizer_class)
-        assert row.policy == "MlpPolicy" or isinstance(model.policy, row.policy)
-
-
-def test_ratios_by_hand(monkeypatch):
-    clock = iter(np.cumsum([0, 3, 0, 1, 0, 8, 0, 2]))
-    monkeypatch.setattr("benchmarks.speed.timing.time.process_time", lambda: next(clock))
-    case = cases.Case("title", {"one": None, "other": None}, {"call": lambda model: None}, [("one", "other")])
-    monkeypatch.setattr("benchmarks.speed.timing.n_operations", lambda call: 2)
-    table = ratios(case, 2)
-    assert [list(column.cells) for column in table.columns] == [["call"], ["one / other"], ["3.50"], ["3.00"], ["4.00"]]
-    assert table.caption.endswith(": 1.00")
-
-
-def test_operations_by_hand():
-    import torch as th
-
-    assert n_operations(lambda: th.ones(2, 3) @ th.ones(3, 4)) == 2 * 2 * 3 * 4

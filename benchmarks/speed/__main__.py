@@ -1,30 +1,68 @@
 """
-What churn reduction costs: the base algorithm, C-CHAIN, and the loop that copies the network at every minibatch, timed in turn
-in one process under the shipped settings. Prints ratios, so that the machine's own speed drops out, and how many times as many
-floating-point operations are needed.
+What churn reduction, the related methods and the monitors cost. All is measured on one core, in processor time, and models
+that are compared are timed in turn: figures depend little on what else the machine does. The tables are printed in Markdown.
 
-    python -m benchmarks.speed
-    python -m benchmarks.speed --case minatar procgen
+    python -m benchmarks.speed --write                   # all of them, into the documentation
+    python -m benchmarks.speed --case minatar procgen    # these
 """
 
 import argparse
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
 
 import torch as th
-from rich.console import Console
 
+from benchmarks.grid.run import ROOT
+from benchmarks.speed import sbx_ppo
 from benchmarks.speed.cases import CASES
-from benchmarks.speed.timing import ratios
+from benchmarks.speed.memory import memory_table
+from benchmarks.speed.monitor_cost import monitor_table
+from benchmarks.speed.tables import Table, write_tables
+from benchmarks.speed.timing import time_case
+
+
+def made_with() -> str:
+    """
+    :return: The versions that figures depend on
+    """
+    packages = ["torch", "stable_baselines3", *(["sbx-rl", "jax"] if sbx_ppo.is_installed() else [])]
+    return "Measured with " + ", ".join(f"{package} {version(package)}" for package in packages) + "."
+
+
+def table_of(case: str, n_rounds: int | None) -> Table:
+    """
+    :param case: Name of a case
+    :param n_rounds: Timings of each
+    :return: Its table
+    """
+    return time_case(CASES[case](), n_rounds)
 
 
 def main() -> None:
-    """Parse the command line, measure, print."""
+    """Parse the command line, measure, print, write."""
+    others: dict[str, Callable[[], Table]] = {"memory": memory_table, "monitors": monitor_table}
+    names = [*CASES, *others]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", nargs="+", default=list(CASES), choices=list(CASES), help="What to time")
-    parser.add_argument("--rounds", type=int, default=20, help="Timings of each")
+    parser.add_argument("--case", nargs="+", default=names, choices=names, help="What to measure")
+    parser.add_argument("--rounds", type=int, help="Timings of each, instead of each case's own number")
+    parser.add_argument("--write", action="store_true", help="Put the tables into their places in docs/")
     args = parser.parse_args()
     th.set_num_threads(1)
+    if hasattr(os, "sched_setaffinity"):  # Linux
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    if not sbx_ppo.is_installed():
+        print('SBX is left out: pip install "sb3-cchain[sbx]"')
+    texts = {"made_with": made_with()} if args.case == names else {}
     for name in args.case:
-        Console().print(ratios(CASES[name](), args.rounds))
+        start = time.monotonic()
+        measure = others.get(name) or partial(table_of, name, args.rounds)
+        texts[name] = measure().markdown()
+        print(f"\n{name}, {time.monotonic() - start:.0f} s\n\n{texts[name]}", flush=True)
+    if args.write:
+        write_tables(texts, ROOT / "docs")
 
 
 if __name__ == "__main__":

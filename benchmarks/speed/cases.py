@@ -1,54 +1,32 @@
 """What is timed: models under the same shipped settings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import torch as th
 from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
 from benchmarks.grid.run import shipped_hyperparameters
+from benchmarks.speed import sbx_ppo
 from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
-from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, seconds
+from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.methods import ReDo
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
+from sb3_cchain.networks.lean_distributions import make_lean
+from sb3_cchain.replaced import replaced
 
 # What RL Zoo takes out of the hyperparameters before it makes the model
 NOT_MODEL_ARGUMENTS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}
 
-
 # Methods that by default act less often than once in what is timed, so that they would seem to cost nothing
 EACH_ITERATION: dict[type[BaseCallback], dict[str, Any]] = {ReDo: {"interval": 1}}
-
-
-@dataclass
-class Case:
-    """
-    Models under the same settings, and what is timed of each.
-
-    :param title: Human-readable name
-    :param models: By name
-    :param measures: By name, what is timed: a call on a model
-    :param pairs: Names of models whose seconds are divided by each other
-    """
-
-    title: str
-    models: dict[str, Any]
-    measures: dict[str, Callable[[Any], Any]]
-    pairs: list[tuple[str, str]]
-
-
-def churn_pairs(base: str, cchain: str) -> list[tuple[str, str]]:
-    """
-    :param base: Name of the base algorithm
-    :param cchain: Name of the same with churn reduction
-    :return: The pairs of these two and the loop that copies the network
-    """
-    return [(cchain, base), (cchain, "deep copy"), ("deep copy", base)]
 
 
 def model_settings(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
@@ -68,36 +46,95 @@ def model_settings(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
     return {**settings, "env": env_id, "seed": 0, "device": "cpu", **changed}
 
 
-def ppo(env_id: str, **changed: Any) -> Case:
+def timed_learn(model: Any, n_steps: int, whole: str) -> dict[str, float]:
+    """
+    :param model: A model
+    :param n_steps: Environment steps
+    :param whole: Name of the measure that is all of it
+    :return: Seconds of ``train()``, and of all
+    """
+    train = model.train
+    in_train: list[float] = []
+
+    def timed_train(*args: Any, **kwargs: Any) -> None:
+        in_train.append(seconds(partial(train, *args, **kwargs)))
+
+    # CChainPPO and CChainDQN would add these callbacks by themselves
+    callbacks: list[BaseCallback] = [TaskSync(), ContinualMetrics()]
+    with replaced(model, "train", timed_train):
+        total = seconds(lambda: model.learn(n_steps, callback=callbacks, reset_num_timesteps=False))
+    return {TRAIN: sum(in_train), whole: total}
+
+
+def iteration(model: OnPolicyAlgorithm) -> dict[str, float]:
+    """
+    :param model: A model
+    :return: Seconds of ``train()`` and of the whole iteration
+    """
+    return timed_learn(model, model.n_steps * model.n_envs, "iteration (rollout and `train()`)")
+
+
+def ppo(env_id: str, product: Callable[[], Product], n_rounds: int, sbx: bool = True, **changed: Any) -> Case:
     """
     :param env_id: Environment id
+    :param product: Makes the largest product of a forward pass
+    :param n_rounds: How often each model is timed
+    :param sbx: Whether SBX has the network
     :param changed: Arguments that differ from the shipped settings
     :return: PPO under the settings of that environment
     """
-    settings = model_settings("ppo", env_id, **changed)
-    cchain = CChainPPO(**model_settings("ppo_cchain", env_id, **changed))
-    models = {"PPO": PPO(**settings), "CChainPPO": cchain, "deep copy": DeepCopyPPO(**settings)}
-    for model in models.values():
-        model.learn(2 * model.n_steps)  # warm; every later update has a churn loss
-    return Case(
-        f"{env_id} {changed or ''}",
-        models,
-        {
-            "train()": lambda model: model.train(),
-            "iteration (rollout and train)": lambda model: model.learn(model.n_steps, reset_num_timesteps=False),
-        },
-        churn_pairs("PPO", "CChainPPO"),
-    )
+    stock = partial(model_settings, "ppo", env_id, **changed)
+    cchain = partial(model_settings, "ppo_cchain", env_id, **changed)
+    models: dict[str, PPO] = {
+        "PPO": PPO(**stock()),
+        "lean PPO": make_lean(PPO(**stock())),
+        "CChainPPO": CChainPPO(**cchain()),
+        'CChainPPO, `churn_reference="next"`': CChainPPO(**cchain(), churn_reference="next"),
+        "deep copy": DeepCopyPPO(**stock()),
+    }
+    entries = {}
+    for name, model in models.items():
+        iteration(model)  # from here on, every update has a churn loss
+        entries[name] = Entry(partial(iteration, model), n_operations(model.train))
+    if sbx and sbx_ppo.is_installed():
+        # The algorithm is PPO's, and so are the operations that it needs
+        entries["SBX's PPO"] = Entry(sbx_ppo.SBXProcess(env_id, **changed).iteration, entries["PPO"].n_operations)
+    note = f"Differs from the shipped settings: {changed}." if changed else ""
+    return Case(entries, ("PPO", "lean PPO"), n_rounds, product(), note)
+
+
+def matrix_product(n_rows: int, n_inputs: int, n_outputs: int) -> Product:
+    """
+    :param n_rows: Size of the minibatch
+    :param n_inputs: Inputs of the layer
+    :param n_outputs: Outputs of the layer
+    :return: The product of a linear layer
+    """
+    name = f"the product of a {n_rows} × {n_inputs} and a {n_inputs} × {n_outputs} matrix"
+    return Product(name, partial(th.mm, th.ones(n_rows, n_inputs), th.ones(n_inputs, n_outputs)))
+
+
+def convolution(n_images: int, size: int, n_inputs: int, n_outputs: int) -> Product:
+    """
+    :param n_images: Size of the minibatch
+    :param size: Height and width of the images
+    :param n_inputs: Channels of the images
+    :param n_outputs: Channels of the result
+    :return: A 3×3 convolution, in the layout that it is fastest in
+    """
+    name = f"a 3 × 3 convolution of {n_images} images of {size} × {size} with {n_inputs} channels to {n_outputs} channels"
+    images = th.ones(n_images, n_inputs, size, size).contiguous(memory_format=th.channels_last)
+    return Product(name, partial(nn.functional.conv2d, images, th.ones(n_outputs, n_inputs, 3, 3), padding=1))
 
 
 def related() -> Case:
     """
     :return: PPO under the Gym Control settings with each of the methods of the registry that are settings of PPO, and C-CHAIN
     """
-    settings = model_settings("ppo", "Continual/Acrobot-v1")
-    adam = settings["policy_kwargs"].pop("optimizer_kwargs")
 
     def make(method: Method) -> tuple[Any, list[BaseCallback]]:
+        settings = model_settings("ppo", "Continual/Acrobot-v1")
+        adam = settings["policy_kwargs"].pop("optimizer_kwargs")
         policy_kwargs = {"optimizer_kwargs": adam, **settings["policy_kwargs"], **method.policy_kwargs}
         if method.optimizer_class is not None:
             optimizer_kwargs = {"base_kwargs": adam, **method.optimizer_kwargs}
@@ -106,22 +143,18 @@ def related() -> Case:
         # Each with the callbacks that it learns with
         return model, [callback(**EACH_ITERATION.get(callback, {})) for callback in method.callbacks]
 
-    models = {method.label: make(method) for method in REGISTRY if issubclass(method.algorithm, PPO)}
-    vanilla = BY_ALGO["ppo"].label
-
     # Callbacks act around train(), some only between the iterations of a learn(). No task switches in between.
-    def iterations(made: Any) -> None:
-        model, callbacks = made
-        model.learn(5 * model.n_steps, callback=callbacks, reset_num_timesteps=False)
+    def iterations(model: Any, callbacks: list[BaseCallback]) -> dict[str, float]:
+        learn = partial(model.learn, 3 * model.n_steps, callback=[TaskSync(), ContinualMetrics(), *callbacks])
+        return {"3 iterations": seconds(partial(learn, reset_num_timesteps=False))}
 
-    for made in models.values():
-        iterations(made)
-    return Case(
-        "Continual/Acrobot-v1, related methods",
-        models,
-        {"5 iterations": iterations},
-        [(name, vanilla) for name in models if name != vanilla],
-    )
+    entries = {}
+    for method in REGISTRY:
+        if issubclass(method.algorithm, PPO):
+            round_of_it = partial(iterations, *make(method))
+            round_of_it()
+            entries[method.label] = Entry(round_of_it)
+    return Case(entries, [BY_ALGO["ppo"].label], n_rounds=4)
 
 
 def minatar(n_past_updates: int = 0) -> Case:
@@ -134,28 +167,28 @@ def minatar(n_past_updates: int = 0) -> Case:
     cchain = CChainDQN(**model_settings("dqn_cchain", "Continual/MinAtar-v0", **changed))
     models: dict[str, Any] = {"DoubleDQN": DoubleDQN(**settings), "CChainDQN": cchain}
     models["deep copy"] = DeepCopyDQN(**{name: value for name, value in settings.items() if name not in ("double_q", "loss")})
-    for model in models.values():
-        model.learn(1200)
+    entries = {}
+    for name, model in models.items():
+        timed_learn(model, 1200, "")
+        one_update = partial(model.train, gradient_steps=1, batch_size=model.batch_size)
+        round_of_it = partial(timed_learn, model, 200, "environment step and update")
+        entries[name] = Entry(round_of_it, 200 * n_operations(one_update))
     for _ in range(n_past_updates):
         models["CChainDQN"].churn_reducer.coefficient.update(0.01, 1e-6)
         models["deep copy"].td_losses.append(0.01)
         models["deep copy"].churn_losses.append(1e-6)
-    return Case(
-        "Continual/MinAtar-v0" + (f" after {n_past_updates} updates" if n_past_updates else ""),
-        models,
-        {
-            "100 × train()": lambda model: [model.train(gradient_steps=1, batch_size=32) for _ in range(100)],
-            "100 environment steps, an update each": lambda model: model.learn(100, reset_num_timesteps=False),
-        },
-        churn_pairs("DoubleDQN", "CChainDQN"),
-    )
+    note = "Seconds are of 200 steps with an update each."
+    return Case(entries, ["DoubleDQN"], 15, matrix_product(32, 1024, 128), note)
 
 
 CASES: dict[str, Callable[[], Case]] = {
-    "gym_control": partial(ppo, "Continual/Acrobot-v1"),
-    # One epoch, as a round would take minutes
-    "procgen": partial(ppo, "Continual/Starpilot-v0", n_epochs=1),
-    "dmc": partial(ppo, "Continual/Walker-v0", n_epochs=1),
+    "gym_control": partial(ppo, "Continual/Acrobot-v1", partial(matrix_product, 32, 256, 256), n_rounds=15),
+    # A quarter of the rollout
+    "dmc": partial(ppo, "Continual/Walker-v0", partial(matrix_product, 64, 256, 256), n_rounds=8, n_steps=512),
+    # One epoch. SBX has the Nature CNN only
+    "procgen": partial(
+        ppo, "Continual/Starpilot-v0", partial(convolution, 125, 32, 16, 32), n_rounds=3, sbx=False, n_epochs=1
+    ),
     "related": related,
     "minatar": minatar,
     "minatar_later": partial(minatar, n_past_updates=50_000),

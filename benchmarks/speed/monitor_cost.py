@@ -1,30 +1,22 @@
 """
 What the callbacks cost that look at training, each with its defaults: the processor time spent in them as a share of that of
 the rest of the same training. Two trainings, with and without, differ by more than that on a machine that does other things.
-
-    python -m benchmarks.speed.monitor_cost
-    python -m benchmarks.speed.monitor_cost --impala   # one NTK of the IMPALA network, of 100 minibatches of 64 x 256 steps
 """
 
-import argparse
-import resource
 from typing import Any
 
-import torch as th
-from rich.console import Console
-from rich.table import Table
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import FakeImageEnv
 
+from benchmarks.speed.big_rollout import N_ENVS, N_STEPS, in_process, peak_memory, with_rollout
 from benchmarks.speed.cases import model_settings
+from benchmarks.speed.tables import Table
 from benchmarks.speed.time_inside import TimeInside
 from benchmarks.speed.timing import seconds
 from sb3_cchain import ChurnMonitor
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
-from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.analysis.ntk import policy_ntk
 
 MONITORS: list[type[BaseCallback]] = [ChurnMonitor, NTKCallback, NetworkHealth]
 
@@ -47,41 +39,34 @@ def cost(algorithm: type[BaseAlgorithm], settings: dict[str, Any], monitor: Base
     return inside.seconds, total - inside.seconds
 
 
-def impala() -> str:
+def ntk_of_impala() -> tuple[float, float]:
     """
-    :return: What one NTK of the IMPALA network costs, as a sentence. The rollout is of random images in ProcGen's shape
+    :return: Seconds of one NTK of the IMPALA network, and the greatest resident memory of this process in GB
     """
-    env = make_vec_env(FakeImageEnv, 64, seed=0, env_kwargs=dict(screen_height=64, screen_width=64, n_channels=3))
-    settings = dict(policy=ImpalaPolicy, env=env, n_steps=256, batch_size=1024, n_epochs=1, seed=0, device="cpu")
-    inside, _ = cost(PPO, settings, NTKCallback(), 64 * 256)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    return f"The NTK of the IMPALA network: {inside:.0f} s of processor time; the process needed {memory:.1f} GB at most."
+    model = with_rollout(PPO, "ppo")
+    return seconds(lambda: policy_ntk(model, n_minibatches=100)), peak_memory()
 
 
-def main() -> None:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--impala", action="store_true", help="Of the IMPALA network, once")
-    args = parser.parse_args()
-    th.set_num_threads(1)
-    if args.impala:
-        print(impala())
-        return
+def monitor_table() -> Table:
+    """
+    :return: For each training, the share of each monitor
+    """
     minatar = model_settings("dqn", "Continual/MinAtar-v0", buffer_size=20_000, learning_starts=400)
     cart_pole = dict(policy="MlpPolicy", env="CartPole-v1", seed=0, device="cpu")
-    # Ten iterations of PPO; as many updates of DQN as are between two looks
+    # Five iterations of PPO; as many updates of DQN as are between two looks
     trainings: dict[str, tuple[type[BaseAlgorithm], dict[str, Any], int]] = {
-        "PPO, Gym Control": (PPO, model_settings("ppo", "Continual/Acrobot-v1"), 8000),
-        "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 20_480),
+        "PPO, Gym Control (3 × 256 units)": (PPO, model_settings("ppo", "Continual/Acrobot-v1"), 4000),
+        "PPO, CartPole, SB3's defaults": (PPO, cart_pole, 10_240),
         "DQN, MinAtar": (DQN, minatar, 2400),
         "DQN, CartPole, SB3's defaults": (DQN, cart_pole, 8100),
     }
-    table = Table("", *(monitor.__name__ for monitor in MONITORS), title="Processor time beside that of the rest of training")
+    rows = []
     for name, (algorithm, settings, n_steps) in trainings.items():
         costs = [cost(algorithm, settings, monitor(), n_steps) for monitor in MONITORS]
-        table.add_row(name, *(f"{inside / rest:.1%}" for inside, rest in costs))
-    Console().print(table)
-
-
-if __name__ == "__main__":
-    main()
+        rows.append([name, *(f"{100 * inside / rest:.1f} %" for inside, rest in costs)])
+    ntk_seconds, memory = in_process(ntk_of_impala)
+    note = (
+        f"One NTK of the IMPALA network (m = 100) with a rollout of {N_ENVS} × {N_STEPS} steps takes {ntk_seconds:.0f} "
+        f"seconds; the process needs {memory:.1f} GB at most."
+    )
+    return Table(["", *(f"`{monitor.__name__}`" for monitor in MONITORS)], rows, note)

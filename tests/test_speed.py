@@ -1,0 +1,195 @@
+"""The command ``speed``: what is timed, how figures are made of seconds, where tables are written."""
+
+import re
+import sys
+from functools import partial
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
+from torch import nn
+
+from benchmarks.grid.run import ROOT
+from benchmarks.speed import __main__ as speed
+from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
+from benchmarks.speed.tables import PLACE, Table, write_tables
+from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
+from sb3_cchain.methods.registry import REGISTRY
+
+# Two updates of tiny networks
+TINY = dict(n_steps=16, batch_size=8, n_epochs=1, policy_kwargs=dict(net_arch=[8], activation_fn=nn.ReLU))
+
+
+def tiny_case(**changed):
+    return cases.ppo("Continual/CartPole-v1", partial(cases.matrix_product, 8, 8, 8), n_rounds=1, **{**TINY, **changed})
+
+
+def test_figures_by_hand(monkeypatch):
+    """Two rounds: the base takes 1 and 2 seconds for 100 operations, the other 3 and 8 for 150."""
+    seconds = {"base": iter([1, 2]), "other": iter([3, 8])}
+    entries = {
+        name: Entry(lambda name=name: {TRAIN: next(seconds[name]), "all": 10.0}, operations)
+        for name, operations in (("base", 100), ("other", 150))
+    }
+    monkeypatch.setattr(Product, "operations_per_second", lambda self: 200.0)
+    table = time_case(Case(entries, ["base"], n_rounds=2, product=Product("a product", None), note="Said by the case."))
+    assert table.header == ["", "", "seconds", "time / base", "operations / base", "speed"]
+    assert table.rows == [
+        [TRAIN, "base", "1.5", "1", "1.00", "38 %"],  # 100 and 50 of 200
+        [TRAIN, "other", "5.5", "3.50 (3.00 to 4.00)", "1.50", "17 %"],  # 50 and 18.75 of 200
+        ["all", "base", "10", "1", "", ""],
+        ["all", "other", "10", "1.00 (1.00 to 1.00)", "", ""],
+    ]
+    assert table.note.startswith("2 rounds.") and "a product" in table.note and table.note.endswith("Said by the case.")
+
+
+def test_entries_are_timed_in_turn():
+    order = []
+    entries = {name: Entry(lambda name=name: order.append(name) or {"all": 1.0}) for name in "ab"}
+    assert time_case(Case(entries, ["b"], n_rounds=5), 2).header == ["", "", "seconds", "time / b"]
+    assert order == ["a", "b", "a", "b"]
+
+
+def test_operations_by_hand():
+    assert n_operations(lambda: th.ones(2, 3) @ th.ones(3, 4)) == 2 * 2 * 3 * 4
+    assert n_operations(cases.matrix_product(2, 3, 4).compute) == 2 * 2 * 3 * 4
+    # Each output is the sum of 3 × 3 × 5 products
+    assert n_operations(cases.convolution(2, 6, 5, 7).compute) == 2 * 2 * 6 * 6 * 7 * 3 * 3 * 5
+
+
+def test_a_product_is_repeated_until_it_can_be_timed(monkeypatch):
+    clock = iter([0.0, 0.5])
+    monkeypatch.setattr("benchmarks.speed.timing.time.process_time", lambda: next(clock))
+    monkeypatch.setattr("benchmarks.speed.timing.PRODUCT_OPERATIONS", 100)
+    calls = []
+    product = Product("", lambda: calls.append(1) or th.ones(2, 3) @ th.ones(3, 4))  # 48 operations
+    assert product.operations_per_second() == 3 * 48 / 0.5
+    assert len(calls) == 1 + 3  # counted, timed
+
+
+def test_ppo_is_timed_with_its_shipped_settings(monkeypatch):
+    monkeypatch.setattr(sbx_ppo, "is_installed", lambda: False)
+    entries = tiny_case().entries
+    assert list(entries) == ["PPO", "lean PPO", "CChainPPO", 'CChainPPO, `churn_reference="next"`', "deep copy"]
+    models = {name: entry.round.args[0] for name, entry in entries.items()}
+    assert all(model.gamma == 0.99 and model.n_steps == 16 for model in models.values())
+    assert type(models["PPO"]) is type(models["lean PPO"]) is PPO
+    assert type(models["PPO"].policy.action_dist) is not type(models["lean PPO"].policy.action_dist)
+    operations = {name: entry.n_operations for name, entry in entries.items()}
+    assert operations["PPO"] == operations["lean PPO"]
+    # A tiny network has as many operations in its policy as in its value function; a reference batch costs 4/3 of the former
+    assert 1.5 < operations["deep copy"] / operations["PPO"] < 1.9
+    assert operations['CChainPPO, `churn_reference="next"`'] < operations["CChainPPO"]
+    for entry in entries.values():
+        timed = entry.round()
+        assert 0 < timed[TRAIN] < timed["iteration (rollout and `train()`)"]
+    assert all(model.num_timesteps == 2 * 16 for model in models.values())
+
+
+def test_related_methods_are_timed_as_the_registry_has_them(monkeypatch):
+    """Each row of PPO, with its parts."""
+    trained = []
+
+    def learn(self, total_timesteps, callback, *args, **kwargs):
+        trained.append((self, callback))
+
+    monkeypatch.setattr(PPO, "learn", learn)
+    case = cases.related()
+    rows = [row for row in REGISTRY if issubclass(row.algorithm, PPO)]
+    assert list(case.entries) == [row.label for row in rows] and len(trained) == len(rows) > 10
+    assert list(case.bases) == ["PPO"]
+    for row, (model, callbacks) in zip(rows, trained, strict=True):
+        assert type(model) is row.algorithm
+        assert [type(callback) for callback in callbacks[2:]] == list(row.callbacks)
+        assert row.optimizer_class is None or isinstance(model.policy.optimizer, row.optimizer_class)
+        assert row.policy == "MlpPolicy" or isinstance(model.policy, row.policy)
+
+
+def test_sbx_has_the_same_settings():
+    """In a process of its own; in this one, the model that is made there."""
+    pytest.importorskip("sbx")
+    model = sbx_ppo.make_sbx_ppo("Continual/Acrobot-v1")
+    stock = PPO(**cases.model_settings("ppo", "Continual/Acrobot-v1"))
+    for name in ("n_steps", "batch_size", "n_epochs", "learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef"):
+        assert getattr(model, name) == getattr(stock, name)
+    shapes = {
+        state: sorted(value.shape for layer in parameters["params"].values() for value in layer.values())
+        for state, parameters in (("actor", model.policy.actor_state.params), ("critic", model.policy.vf_state.params))
+    }
+    assert shapes["actor"] == sorted([(6, 256), (256,), (256, 256), (256,), (256, 256), (256,), (256, 3), (3,)])
+    assert shapes["critic"] == sorted([(6, 256), (256,), (256, 256), (256,), (256, 256), (256,), (256, 1), (1,)])
+    inputs = th.tensor([-2.0, 3.0])
+    for module in (nn.LeakyReLU(0.1), nn.ReLU()):
+        assert np.allclose(sbx_ppo.flax_activation(module)(inputs.numpy()), module(inputs))
+    with pytest.raises(TypeError, match="Tanh"):
+        sbx_ppo.flax_activation(nn.Tanh())
+
+
+@pytest.mark.slow
+def test_sbx_is_timed():
+    pytest.importorskip("sbx")
+    entry = tiny_case(policy_kwargs=dict(net_arch=[8], activation_fn=nn.ReLU)).entries["SBX's PPO"]
+    timed = entry.round()
+    assert 0 < timed[TRAIN] < timed["iteration (rollout and `train()`)"]
+
+
+def test_memory_is_that_of_a_train_that_has_begun():
+    model = big_rollout.with_rollout(PPO, "ppo", n_envs=2, n_steps=16, batch_size=8)
+    model.set_logger(configure(None, [""]))
+    assert 100 < model.rollout_buffer.observations.mean() < 155
+    steps = []
+    model.policy.optimizer.register_step_post_hook(lambda *_: steps.append(1))
+    memory.start_train(model, 2)
+    assert len(steps) == 2
+    with pytest.raises(RuntimeError, match=r"has only \d+ updates"):
+        memory.start_train(model, 1000)
+    assert 0.05 < big_rollout.peak_memory() < 50
+
+
+def test_tables_are_written_between_their_comments(tmp_path):
+    page = tmp_path / "folder" / "page.md"
+    page.parent.mkdir()
+    before = "Before.\n<!-- table: one -->\n<!-- end -->\n\n<!-- table: two -->\n\nold\n\n<!-- end -->\nAfter.\n"
+    page.write_text(before)
+    write_tables({"one": "new"}, tmp_path)
+    assert page.read_text() == before.replace("one -->\n", "one -->\n\nnew\n\n")
+    write_tables({"one": "newer", "two": "2"}, tmp_path)
+    expected = "Before.\n<!-- table: one -->\n\nnewer\n\n<!-- end -->\n\n<!-- table: two -->\n\n2\n\n<!-- end -->\nAfter.\n"
+    assert page.read_text() == expected
+    with pytest.raises(ValueError, match="three"):
+        write_tables({"three": "3"}, tmp_path)
+
+
+def test_a_table_in_markdown():
+    table = Table(["", "a"], [["b", "1"]], "A note. " * 30)
+    lines = table.markdown().splitlines()
+    assert lines[:4] == ["|  | a |", "| --- | --- |", "| b | 1 |", ""]
+    assert max(map(len, lines)) <= 120
+
+
+def test_the_command_writes_what_it_measured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(speed.os, "sched_setaffinity", lambda *_: None, raising=False)
+    monkeypatch.setattr(speed, "ROOT", tmp_path)
+    monkeypatch.setattr(speed, "CASES", {"one": lambda: Case({"a": Entry(lambda: {"all": 1.0})}, ["a"], n_rounds=3)})
+    monkeypatch.setattr(speed, "memory_table", lambda: Table(["memory"], [], ""))
+    monkeypatch.setattr(speed, "monitor_table", lambda: Table(["monitors"], [], ""))
+    (tmp_path / "docs").mkdir()
+    page = tmp_path / "docs" / "page.md"
+    names = ["made_with", "one", "memory", "monitors"]
+    page.write_text("".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in names))
+    monkeypatch.setattr(sys, "argv", ["speed", "--rounds", "2"])
+    speed.main()
+    assert "2 rounds." in capsys.readouterr().out and "rounds" not in page.read_text()
+    monkeypatch.setattr(sys, "argv", ["speed", "--write"])
+    speed.main()
+    for part in ("3 rounds.", "| memory |", "| monitors |", f"torch {version('torch')}"):
+        assert part in page.read_text()
+
+
+def test_each_table_has_one_place_in_the_documentation():
+    places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
+    assert sorted(places) == sorted(["made_with", *cases.CASES, "memory", "monitors"])
+    assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
