@@ -174,22 +174,21 @@ def test_the_command_writes_what_it_measured(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(speed.os, "sched_setaffinity", lambda *_: None, raising=False)
     monkeypatch.setattr(speed, "ROOT", tmp_path)
     monkeypatch.setattr(speed, "CASES", {"one": lambda: Case({"a": Entry(lambda: {"all": 1.0})}, ["a"], n_rounds=3)})
-    monkeypatch.setattr(speed, "memory_table", lambda: Table(["memory"], [], ""))
-    monkeypatch.setattr(speed, "monitor_table", lambda: Table(["monitors"], [], ""))
+    monkeypatch.setattr(speed, "OTHERS", {"other": lambda: Table(["another way"], [], "")})
     (tmp_path / "docs").mkdir()
     page = tmp_path / "docs" / "page.md"
-    names = ["made_with", "one", "memory", "monitors"]
+    names = ["made_with", "one", "other"]
     page.write_text("".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in names))
     monkeypatch.setattr(sys, "argv", ["speed", "--rounds", "2"])
     speed.main()
     assert "2 rounds." in capsys.readouterr().out and "rounds" not in page.read_text()
     monkeypatch.setattr(sys, "argv", ["speed", "--write"])
     speed.main()
-    for part in ("3 rounds.", "| memory |", "| monitors |", f"torch {version('torch')}"):
+    for part in ("3 rounds.", "| another way |", f"torch {version('torch')}"):
         assert part in page.read_text()
 
 
 def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
-    assert sorted(places) == sorted(["made_with", *cases.CASES, "memory", "monitors"])
+    assert sorted(places) == sorted(["made_with", *speed.CASES, *speed.OTHERS])
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))

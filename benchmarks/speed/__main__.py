@@ -7,6 +7,7 @@ that are compared are timed in turn: figures depend little on what else the mach
 """
 
 import argparse
+import multiprocessing
 import os
 import time
 from collections.abc import Callable
@@ -23,6 +24,9 @@ from benchmarks.speed.monitor_cost import monitor_table
 from benchmarks.speed.tables import Table, write_tables
 from benchmarks.speed.timing import time_case
 
+# Beside the cases, what is measured in another way
+OTHERS: dict[str, Callable[[], Table]] = {"memory": memory_table, "monitors": monitor_table}
+
 
 def made_with() -> str:
     """
@@ -38,13 +42,15 @@ def table_of(case: str, n_rounds: int | None) -> Table:
     :param n_rounds: Timings of each
     :return: Its table
     """
-    return time_case(CASES[case](), n_rounds)
+    table = time_case(CASES[case](), n_rounds)
+    for process in multiprocessing.active_children():  # SBX's
+        process.terminate()
+    return table
 
 
 def main() -> None:
     """Parse the command line, measure, print, write."""
-    others: dict[str, Callable[[], Table]] = {"memory": memory_table, "monitors": monitor_table}
-    names = [*CASES, *others]
+    names = [*CASES, *OTHERS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", nargs="+", default=names, choices=names, help="What to measure")
     parser.add_argument("--rounds", type=int, help="Timings of each, instead of each case's own number")
@@ -55,14 +61,15 @@ def main() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if not sbx_ppo.is_installed():
         print('SBX is left out: pip install "sb3-cchain[sbx]"')
-    texts = {"made_with": made_with()} if args.case == names else {}
     for name in args.case:
         start = time.monotonic()
-        measure = others.get(name) or partial(table_of, name, args.rounds)
-        texts[name] = measure().markdown()
-        print(f"\n{name}, {time.monotonic() - start:.0f} s\n\n{texts[name]}", flush=True)
-    if args.write:
-        write_tables(texts, ROOT / "docs")
+        measure = OTHERS.get(name) or partial(table_of, name, args.rounds)
+        text = measure().markdown()
+        print(f"\n{name}, {time.monotonic() - start:.0f} s\n\n{text}", flush=True)
+        if args.write:
+            write_tables({name: text}, ROOT / "docs")
+    if args.write and args.case == names:
+        write_tables({"made_with": made_with()}, ROOT / "docs")
 
 
 if __name__ == "__main__":

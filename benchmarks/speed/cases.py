@@ -99,7 +99,8 @@ def ppo(env_id: str, product: Callable[[], Product], n_rounds: int, sbx: bool = 
     if sbx and sbx_ppo.is_installed():
         # The algorithm is PPO's, and so are the operations that it needs
         entries["SBX's PPO"] = Entry(sbx_ppo.SBXProcess(env_id, **changed).iteration, entries["PPO"].n_operations)
-    note = f"Differs from the shipped settings: {changed}." if changed else ""
+    different = ", ".join(f"`{name}={value}`" for name, value in changed.items())
+    note = f"Differs from the shipped settings: {different}." if changed else ""
     return Case(entries, ("PPO", "lean PPO"), n_rounds, product(), note)
 
 

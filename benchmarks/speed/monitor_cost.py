@@ -43,7 +43,7 @@ def ntk_of_impala() -> tuple[float, float]:
     """
     :return: Seconds of one NTK of the IMPALA network, and the greatest resident memory of this process in GB
     """
-    model = with_rollout(PPO, "ppo")
+    model = with_rollout(PPO, "ppo", batch_size=128)
     return seconds(lambda: policy_ntk(model, n_minibatches=100)), peak_memory()
 
 
