@@ -15,6 +15,7 @@ from torch import nn
 from benchmarks.grid.run import ROOT
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
+from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
 from sb3_cchain.methods.registry import REGISTRY
@@ -112,7 +113,7 @@ def test_sbx_has_the_same_settings():
     """In a process of its own; in this one, the model that is made there."""
     pytest.importorskip("sbx")
     model = sbx_ppo.make_sbx_ppo("Continual/Acrobot-v1")
-    stock = PPO(**cases.model_settings("ppo", "Continual/Acrobot-v1"))
+    stock = PPO(**model_settings("ppo", "Continual/Acrobot-v1"))
     for name in ("n_steps", "batch_size", "n_epochs", "learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef"):
         assert getattr(model, name) == getattr(stock, name)
     shapes = {

@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 
-from benchmarks.speed.cases import model_settings
+from benchmarks.speed.settings import model_settings
 
 N_ENVS, N_STEPS = 64, 256
 

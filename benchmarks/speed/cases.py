@@ -5,73 +5,22 @@ from functools import partial
 from typing import Any
 
 import torch as th
-from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from benchmarks.grid.run import shipped_hyperparameters
 from benchmarks.speed import sbx_ppo
 from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
-from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, seconds
-from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
+from benchmarks.speed.settings import model_settings
+from benchmarks.speed.timing import Case, Entry, Product, n_operations, seconds
+from benchmarks.speed.training import iteration, timed_learn
+from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync, make_lean
 from sb3_cchain.methods import ReDo
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
-from sb3_cchain.networks.lean_distributions import make_lean
-from sb3_cchain.replaced import replaced
-
-# What RL Zoo takes out of the hyperparameters before it makes the model
-NOT_MODEL_ARGUMENTS = {"callback", "env_wrapper", "vec_env_wrapper", "normalize", "monitor_kwargs", "n_timesteps"}
 
 # Methods that by default act less often than once in what is timed, so that they would seem to cost nothing
 EACH_ITERATION: dict[type[BaseCallback], dict[str, Any]] = {ReDo: {"interval": 1}}
-
-
-def model_settings(algo: str, env_id: str, **changed: Any) -> dict[str, Any]:
-    """
-    :param algo: Name of a file of hyperparameters
-    :param env_id: Environment id
-    :param changed: Arguments that differ
-    :return: The model's arguments, from the shipped hyperparameters
-    """
-    shipped = shipped_hyperparameters(algo, env_id) or {}
-    settings = {name: value for name, value in shipped.items() if name not in NOT_MODEL_ARGUMENTS}
-    # As RL Zoo reads it
-    if "policy_kwargs" in settings:
-        settings["policy_kwargs"] = eval(settings["policy_kwargs"], {"nn": nn, "get_class_by_name": get_class_by_name})
-    if "." in settings["policy"]:
-        settings["policy"] = get_class_by_name(settings["policy"])
-    return {**settings, "env": env_id, "seed": 0, "device": "cpu", **changed}
-
-
-def timed_learn(model: Any, n_steps: int, whole: str) -> dict[str, float]:
-    """
-    :param model: A model
-    :param n_steps: Environment steps
-    :param whole: Name of the measure that is all of it
-    :return: Seconds of ``train()``, and of all
-    """
-    train = model.train
-    in_train: list[float] = []
-
-    def timed_train(*args: Any, **kwargs: Any) -> None:
-        in_train.append(seconds(partial(train, *args, **kwargs)))
-
-    # CChainPPO and CChainDQN would add these callbacks by themselves
-    callbacks: list[BaseCallback] = [TaskSync(), ContinualMetrics()]
-    with replaced(model, "train", timed_train):
-        total = seconds(lambda: model.learn(n_steps, callback=callbacks, reset_num_timesteps=False))
-    return {TRAIN: sum(in_train), whole: total}
-
-
-def iteration(model: OnPolicyAlgorithm) -> dict[str, float]:
-    """
-    :param model: A model
-    :return: Seconds of ``train()`` and of the whole iteration
-    """
-    return timed_learn(model, model.n_steps * model.n_envs, "iteration (rollout and `train()`)")
 
 
 def ppo(env_id: str, product: Callable[[], Product], n_rounds: int, sbx: bool = True, **changed: Any) -> Case:

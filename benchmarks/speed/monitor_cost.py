@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks.speed.big_rollout import N_ENVS, N_STEPS, in_process, peak_memory, with_rollout
-from benchmarks.speed.cases import model_settings
+from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import Table
 from benchmarks.speed.time_inside import TimeInside
 from benchmarks.speed.timing import seconds

@@ -12,6 +12,9 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from benchmarks.speed.settings import model_settings
+from benchmarks.speed.training import iteration
+
 # One thread, as PyTorch has
 XLA_FLAGS = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
@@ -48,8 +51,6 @@ class SBXProcess:
 
 
 def _serve(connection: Connection, env_id: str, changed: dict[str, Any]) -> None:
-    from benchmarks.speed.cases import iteration
-
     os.environ["XLA_FLAGS"] = XLA_FLAGS
     th.set_num_threads(1)
     model = make_sbx_ppo(env_id, **changed)
@@ -71,8 +72,6 @@ def make_sbx_ppo(env_id: str, **changed: Any) -> Any:
     """
     import jax
     import sbx
-
-    from benchmarks.speed.cases import model_settings
 
     class SBXPPO(sbx.PPO):
         def train(self) -> None:
