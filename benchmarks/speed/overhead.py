@@ -30,7 +30,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from benchmarks.speed.cases import model_settings
+from benchmarks.speed.settings import model_settings
 from benchmarks.speed.time_inside import TimeInside
 from benchmarks.speed.timing import seconds
 from sb3_cchain import CChainDQN, CChainPPO, ContinualEnv
