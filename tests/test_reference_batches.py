@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from sb3_cchain import CChainPPO
 from sb3_cchain.algorithms import on_policy, reference_batches
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
+from sb3_cchain.networks import joint_evaluation
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
@@ -165,6 +166,17 @@ def learn(env, jointly, monkeypatch, **arguments):
 )
 def test_joint_passes_make_the_same_updates(form, kind, size, monkeypatch):
     arguments = dict(FORMS_OF_POLICY[form], churn_reference=kind, churn_batch_size=size, churn_warmup=2)
+    check_same_updates(monkeypatch, arguments)
+
+
+@each_reference
+def test_large_batches_go_one_after_the_other(kind, size, monkeypatch):
+    monkeypatch.setattr(joint_evaluation, "JOINED_AT_MOST", 0)
+    arguments = dict(FORMS_OF_POLICY["gSDE"], churn_reference=kind, churn_batch_size=size, churn_warmup=2)
+    check_same_updates(monkeypatch, arguments)
+
+
+def check_same_updates(monkeypatch, arguments):
     joint, separate = (learn(jointly=jointly, monkeypatch=monkeypatch, **arguments) for jointly in (True, False))
     assert joint.policy.optimizer.state_dict()["state"][0]["step"] == 200
     assert_close(joint, separate, atol=1e-12)

@@ -22,8 +22,10 @@ from sb3_cchain.algorithms.reference_passes import joint_passes, separate_passes
 from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, extra_gradient
 from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_absolute_change, mean_squared_difference
+from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
+from sb3_cchain.networks.policy_inputs import rows
 from sb3_cchain.networks.policy_outputs import (
     as_it_acts,
     has_training_mode,
@@ -81,6 +83,9 @@ def _outputs(model: PPO, observations: PyTorchObs) -> th.Tensor:
     return policy_outputs(model.policy, observations)
 
 
+# Samples of a reference batch on which `churn/value_churn` is measured. All images would take several per cent of an update
+VALUE_CHURN_SAMPLES = 32
+
 # L, by the name in `churn_base_loss`
 BASE_LOSSES = ("actor", "surrogate")
 
@@ -127,7 +132,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions
     - ``churn/policy_churn``: L_churn minus its value without any churn; for discrete actions the Kullback-Leibler
       divergence from the policy before an update to the one after it
     - ``churn/value_churn``: mean absolute change of the state values by the first update of each epoch, unless it is the
-      epoch's only one
+      epoch's only one, on the first 32 samples of its reference batch
 
     L is averaged over the updates.
 
@@ -143,14 +148,17 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions
     old_values: th.Tensor | None = None
     value_churns: list[float] = []
 
+    def values_of(reference: Observations) -> th.Tensor:
+        return policy_values(policy, rows(reference, slice(VALUE_CHURN_SAMPLES)))
+
     def before_update(add_gradient: Callable[[], None]) -> None:
         nonlocal old_values
         with acting():
             if old_values is not None:
                 assert reducer.reference is not None
-                value_churns.append(mean_absolute_change(old_values, policy_values(policy, reducer.reference)))
+                value_churns.append(mean_absolute_change(old_values, values_of(reducer.reference)))
             add_gradient()
-            old_values = policy_values(policy, references.current) if references.starts_epoch else None
+            old_values = values_of(references.current) if references.starts_epoch else None
 
     if options.churn_component == "full" and can_evaluate_jointly(policy):
         passes = joint_passes(policy, reducer, references)
