@@ -11,10 +11,10 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from sb3_cchain import CChainPPO
 from sb3_cchain.algorithms import on_policy, reference_batches
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
-from sb3_cchain.networks import joint_evaluation
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
+    IMAGE,
     assert_churn_was_reduced,
     assert_close,
     assert_equal,
@@ -169,11 +169,18 @@ def test_joint_passes_make_the_same_updates(form, kind, size, monkeypatch):
     check_same_updates(monkeypatch, arguments)
 
 
-@each_reference
-def test_large_batches_go_one_after_the_other(kind, size, monkeypatch):
-    monkeypatch.setattr(joint_evaluation, "JOINED_AT_MOST", 0)
-    arguments = dict(FORMS_OF_POLICY["gSDE"], churn_reference=kind, churn_batch_size=size, churn_warmup=2)
-    check_same_updates(monkeypatch, arguments)
+@pytest.mark.parametrize("kind, jointly", [("independent", False), ("next", True)])
+def test_convolutions_see_one_batch_after_the_other(kind, jointly):
+    env = RandomEnv(observation_space=IMAGE)
+    model = CChainPPO("CnnPolicy", env, churn_reference=kind, n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+    sizes = []
+    model.learn(16)
+    model.policy.features_extractor.register_forward_hook(
+        lambda module, inputs, output: sizes.append(len(output)) if th.is_grad_enabled() else None
+    )
+    model.train()
+    # Of the first update, whose reference batch is one of the rollout before, and of the second
+    assert sizes == ([16, 8] if jointly else [8, 8, 8, 8])
 
 
 def check_same_updates(monkeypatch, arguments):

@@ -24,7 +24,7 @@ from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.churn.divergence import Divergence, cross_entropy, mean_absolute_change, mean_squared_difference
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly, has_convolutions
 from sb3_cchain.networks.policy_inputs import rows
 from sb3_cchain.networks.policy_outputs import (
     as_it_acts,
@@ -160,7 +160,8 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions
             add_gradient()
             old_values = values_of(references.current) if references.starts_epoch else None
 
-    if options.churn_component == "full" and can_evaluate_jointly(policy):
+    pays = options.churn_reference == "next" or not has_convolutions(policy)
+    if pays and options.churn_component == "full" and can_evaluate_jointly(policy):
         passes = joint_passes(policy, reducer, references)
     else:
         passes = separate_passes(policy, reducer, references, options.churn_component)

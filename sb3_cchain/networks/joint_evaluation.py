@@ -10,13 +10,10 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
-from sb3_cchain.networks.policy_inputs import joined, n_observations, n_values
+from sb3_cchain.networks.policy_inputs import joined, n_observations
 from sb3_cchain.networks.policy_outputs import has_own_distribution, has_training_mode
-
-# Two batches go through the network as one while they have at most so many numbers together. As one, large batches of images
-# take longer than one after the other
-JOINED_AT_MOST = 2**18
 
 
 class Evaluation(NamedTuple):
@@ -43,6 +40,14 @@ def can_evaluate_jointly(policy: ActorCriticPolicy) -> bool:
     )
 
 
+def has_convolutions(policy: ActorCriticPolicy) -> bool:
+    """
+    :param policy: An actor-critic policy
+    :return: Whether it has convolutions, which take longer for two batches as one than for one after the other
+    """
+    return any(isinstance(module, (nn.Conv1d, nn.Conv2d, nn.Conv3d)) for module in policy.modules())
+
+
 def evaluate_jointly(
     policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None = None
 ) -> Evaluation:
@@ -54,17 +59,17 @@ def evaluate_jointly(
     :return: The evaluation of the minibatch, and the actor's outputs on both
     """
     n = n_observations(observations)
-    batches = [observations] if further is None or n_observations(further) == 0 else [observations, further]
-    if sum(map(n_values, batches)) <= JOINED_AT_MOST:
-        batches = [joined(*batches)]
-    features = [BasePolicy.extract_features(policy, batch, policy.pi_features_extractor) for batch in batches]
+    together = observations
+    if further is not None and n_observations(further) > 0:
+        together = joined(observations, further)
+    actor_features = BasePolicy.extract_features(policy, together, policy.pi_features_extractor)
     if policy.share_features_extractor:
-        critic_features = features[0][:n]
+        critic_features = actor_features[:n]
     else:
         critic_features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
-    latents = [policy.mlp_extractor.forward_actor(each) for each in features]
-    outputs = th.cat([policy.action_net(latent) for latent in latents])
-    distribution = _distribution(policy, latents[0][:n], outputs[:n])
+    latent = policy.mlp_extractor.forward_actor(actor_features)
+    outputs = policy.action_net(latent)
+    distribution = _distribution(policy, latent[:n], outputs[:n])
     values = policy.value_net(policy.mlp_extractor.forward_critic(critic_features))
     return Evaluation(values, distribution.log_prob(actions), distribution.entropy(), outputs)
 

@@ -14,14 +14,6 @@ def n_observations(observations: PyTorchObs) -> int:
     return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
 
 
-def n_values(observations: PyTorchObs) -> int:
-    """
-    :param observations: Batch of observations
-    :return: How many numbers they consist of
-    """
-    return sum(map(th.numel, observations.values())) if isinstance(observations, dict) else observations.numel()
-
-
 def joined(*batches: PyTorchObs) -> PyTorchObs:
     """
     :param batches: Batches of observations
