@@ -134,9 +134,7 @@ def test_same_training(name, action_space):
 @each_space
 def test_same_training_with_churn_reduction(action_space):
     lean, plain = (
-        CChainPPO("MlpPolicy", RandomEnv(action_space=action_space), lean_distributions=lean, **PPO_SETTINGS).learn(
-            96, log_interval=10**6
-        )
+        CChainPPO("MlpPolicy", RandomEnv(action_space=action_space), lean=lean, **PPO_SETTINGS).learn(96, log_interval=10**6)
         for lean in (True, False)
     )
     assert type(lean.policy.action_dist) is LEAN[type(action_space)]
@@ -176,9 +174,9 @@ def test_save_load_and_copies(tmp_path):
     loaded, stock = CChainPPO.load(tmp_path / "model"), PPO.load(tmp_path / "model")
     assert type(loaded.policy.action_dist) is type(copy.deepcopy(loaded).policy.action_dist) is LEAN[spaces.Discrete]
     assert type(stock.policy.action_dist) is not LEAN[spaces.Discrete]
-    off = CChainPPO("MlpPolicy", RandomEnv(), lean_distributions=False, **PPO_SETTINGS)
+    off = CChainPPO("MlpPolicy", RandomEnv(), lean=False, **PPO_SETTINGS)
     off.save(tmp_path / "off")
-    assert CChainPPO.load(tmp_path / "off").lean_distributions is False
+    assert CChainPPO.load(tmp_path / "off").lean is False
 
 
 def test_compiled_policy():
@@ -190,12 +188,12 @@ def test_compiled_policy():
 
 @pytest.mark.parametrize("lean", [True, False])
 def test_callback(lean):
-    model = PPO("MlpPolicy", RandomEnv(), **PPO_SETTINGS).learn(32, CChainCallback(lean_distributions=lean))
+    model = PPO("MlpPolicy", RandomEnv(), **PPO_SETTINGS).learn(32, CChainCallback(lean=lean))
     assert (type(model.policy.action_dist) is LEAN[spaces.Discrete]) == lean
 
 
 @pytest.mark.parametrize("make", [CChainPPO, CChainCallback])
 def test_bad_argument(make):
     arguments = () if make is CChainCallback else ("MlpPolicy", RandomEnv())
-    with pytest.raises(TypeError, match="`lean_distributions` must be True or False, got 'yes'"):
-        make(*arguments, lean_distributions="yes")
+    with pytest.raises(TypeError, match="`lean` must be True or False, got 'yes'"):
+        make(*arguments, lean="yes")

@@ -211,7 +211,7 @@ def test_hyperparameters(tmp_path):
         "churn_component": "full",
         "churn_reference": "independent",
         "churn_batch_size": 1.0,
-        "lean_distributions": "True",
+        "lean": "True",
     }
 
 

@@ -43,7 +43,7 @@ class CChainCallback(FiniteCheck):
     :param churn_component: As for ``CChainPPO``
     :param churn_reference: As for ``CChainPPO``
     :param churn_batch_size: As for ``CChainPPO``
-    :param lean_distributions: As for ``CChainPPO``. The model keeps them.
+    :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.make_lean`
     :raises ValueError: Naming the argument that is out of its range; when training starts, for a second CChainCallback in the
         same ``learn()``, and for one that another callback holds
     :raises TypeError: When ``reset_churn_coef`` is not a boolean; when training starts, for a model that is not a stock PPO
@@ -63,7 +63,7 @@ class CChainCallback(FiniteCheck):
         churn_component: str = "full",
         churn_reference: str = "independent",
         churn_batch_size: float = 1.0,
-        lean_distributions: bool = True,
+        lean: bool = True,
     ):
         super().__init__()
         self._make_coefficient = partial(
@@ -76,9 +76,9 @@ class CChainCallback(FiniteCheck):
         )
         self._make_coefficient(default_target_ratio=1.0)  # raise on bad values now
         check_bool("reset_churn_coef", reset_churn_coef)
-        check_bool("lean_distributions", lean_distributions)
+        check_bool("lean", lean)
         self._options = PolicyChurnOptions(churn_base_loss, churn_component, churn_reference, churn_batch_size)
-        self.lean_distributions = lean_distributions
+        self.lean = lean
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
         # The methods of the model that are replaced from the end of a rollout to train()
@@ -91,7 +91,7 @@ class CChainCallback(FiniteCheck):
             raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
         self._check_parent()
         add_overview(self.model)
-        if self.lean_distributions:
+        if self.lean:
             make_lean(self.model)
         self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
         past, n_updates = vars(self.model).get("churn_state"), self.model._n_updates

@@ -1,5 +1,6 @@
 """PPO with churn reduction."""
 
+from contextlib import nullcontext
 from typing import Any, TypeVar
 
 from stable_baselines3 import PPO
@@ -9,6 +10,7 @@ from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions, make_policy_reducer, reduced_churn
 from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.networks.lean_distributions import make_lean
+from sb3_cchain.networks.lean_forward import lean_forward
 from sb3_cchain.validation import check_bool
 
 SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
@@ -54,8 +56,9 @@ class CChainPPO(ChurnAlgorithm, PPO):
         ``"independent"`` for other random samples of the rollout, ``"next"`` for the minibatch that is trained on next, which
         costs less because its outputs are needed anyway
     :param churn_batch_size: Size of a reference batch in minibatches: 2, 4 or 8 in the paper's Appendix A.1
-    :param lean_distributions: Whether the policy's action distribution is made without the checks of torch's, which cost more
-        time than a small network: see :func:`~sb3_cchain.make_lean`. The results are the same, to the bit.
+    :param lean: Whether the policy acts without what PyTorch and SB3 do around the operations, which takes longer than a small
+        network: the action distribution is made as by :func:`~sb3_cchain.make_lean`, and in rollouts the layers of an MLP are
+        called directly. The results are the same, to the bit.
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range; during training, for NaN or infinite rewards,
         observations and churn losses, before an update is made with them
@@ -68,15 +71,15 @@ class CChainPPO(ChurnAlgorithm, PPO):
         churn_component: str = "full",
         churn_reference: str = "independent",
         churn_batch_size: float = 1.0,
-        lean_distributions: bool = True,
+        lean: bool = True,
         **kwargs: Any,
     ):
         self.churn_base_loss = churn_base_loss
         self.churn_component = churn_component
         self.churn_reference = churn_reference
         self.churn_batch_size = churn_batch_size
-        self.lean_distributions = lean_distributions
-        check_bool("lean_distributions", lean_distributions)
+        self.lean = lean
+        check_bool("lean", lean)
         self._churn_options()
         super().__init__(*args, **kwargs)
 
@@ -85,12 +88,23 @@ class CChainPPO(ChurnAlgorithm, PPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.lean_distributions:
+        if self.lean:
             make_lean(self)
 
     def _make_churn_reducer(self) -> ChurnReducer:
         self._churn_options()  # load() does not give them to __init__()
         return make_policy_reducer(self, self._make_churn_coefficient)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
+        """
+        As PPO's.
+
+        :param args: As PPO's
+        :param kwargs: As PPO's
+        :return: Whether no callback stopped it
+        """
+        with lean_forward(self.policy) if self.lean else nullcontext():
+            return super().collect_rollouts(*args, **kwargs)
 
     def train(self) -> None:
         """Update the policy with the current rollout, as PPO does, with churn reduction."""

@@ -3,17 +3,12 @@
 from typing import NamedTuple
 
 import torch as th
-from stable_baselines3.common.distributions import (
-    DiagGaussianDistribution,
-    Distribution,
-    StateDependentNoiseDistribution,
-)
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_cchain.networks.policy_inputs import joined, n_observations
-from sb3_cchain.networks.policy_outputs import has_own_distribution, has_training_mode
+from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution, has_training_mode
 
 
 class Evaluation(NamedTuple):
@@ -69,15 +64,6 @@ def evaluate_jointly(
         critic_features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
     latent = policy.mlp_extractor.forward_actor(actor_features)
     outputs = policy.action_net(latent)
-    distribution = _distribution(policy, latent[:n], outputs[:n])
+    distribution = distribution_of(policy, latent[:n], outputs[:n])
     values = policy.value_net(policy.mlp_extractor.forward_critic(critic_features))
     return Evaluation(values, distribution.log_prob(actions), distribution.entropy(), outputs)
-
-
-def _distribution(policy: ActorCriticPolicy, latent: th.Tensor, outputs: th.Tensor) -> Distribution:
-    """As ``policy._get_action_dist_from_latent()``, which computes the outputs, too."""
-    if isinstance(policy.action_dist, StateDependentNoiseDistribution):
-        return policy.action_dist.proba_distribution(outputs, policy.log_std, latent)
-    if isinstance(policy.action_dist, DiagGaussianDistribution):
-        return policy.action_dist.proba_distribution(outputs, policy.log_std)
-    return policy.action_dist.proba_distribution(outputs)

@@ -8,8 +8,10 @@ import torch as th
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
+    DiagGaussianDistribution,
     Distribution,
     MultiCategoricalDistribution,
+    StateDependentNoiseDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -66,6 +68,22 @@ def of_action_net(policy: ActorCriticPolicy, outputs: th.Tensor) -> th.Tensor:
     if isinstance(distribution, BernoulliDistribution):
         return th.stack([(-outputs).sigmoid(), outputs.sigmoid()], dim=-1)
     return outputs
+
+
+def distribution_of(policy: ActorCriticPolicy, latent: th.Tensor, outputs: th.Tensor) -> Distribution:
+    """
+    As ``policy._get_action_dist_from_latent()``, which computes the outputs, too.
+
+    :param policy: An actor-critic policy that makes its distribution as SB3's do
+    :param latent: Inputs of its ``action_net``
+    :param outputs: Outputs of it
+    :return: The action distribution
+    """
+    if isinstance(policy.action_dist, StateDependentNoiseDistribution):
+        return policy.action_dist.proba_distribution(outputs, policy.log_std, latent)
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        return policy.action_dist.proba_distribution(outputs, policy.log_std)
+    return policy.action_dist.proba_distribution(outputs)
 
 
 def has_own_distribution(policy_class: type[nn.Module]) -> bool:

@@ -1,0 +1,146 @@
+"""In rollouts the layers of a plain MLP policy are called directly, with the same results."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+from sb3_cchain import CChainPPO
+from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.networks.lean_forward import LeanForward, is_plain, lean_forward
+from tests.churn_models import ACTION_SPACES, DICT, IMAGE, PPO_SETTINGS, NormalisedExtractor, differ
+from tests.envs import RandomEnv
+
+MATRIX = spaces.Box(-1, 1, (2, 3), np.float32)
+INTEGERS = spaces.Box(0, 9, (4,), np.int64)
+
+PLAIN = {
+    **{type(space).__name__: dict(env=RandomEnv(action_space=space)) for space in ACTION_SPACES},
+    "gSDE": dict(env=RandomEnv(action_space=ACTION_SPACES[3]), use_sde=True),
+    "matrix": dict(env=RandomEnv(observation_space=MATRIX)),
+    "integers": dict(env=RandomEnv(observation_space=INTEGERS)),
+    "own extractors": dict(policy_kwargs=dict(share_features_extractor=False)),
+    "no layers": dict(policy_kwargs=dict(net_arch=[])),
+    "different layers": dict(policy_kwargs=dict(net_arch=dict(pi=[8], vf=[4, 4]), activation_fn=nn.ReLU)),
+}
+
+
+class OwnForwardPolicy(ActorCriticPolicy):
+    def forward(self, obs, deterministic=False):
+        return super().forward(obs, deterministic)
+
+
+OTHERS = {
+    "images": dict(policy="CnnPolicy", env=RandomEnv(observation_space=IMAGE)),
+    "images as vectors": dict(env=RandomEnv(observation_space=IMAGE)),
+    "Dict": dict(policy="MultiInputPolicy", env=RandomEnv(observation_space=DICT)),
+    "Discrete": dict(env=RandomEnv(observation_space=spaces.Discrete(5))),
+    "own forward": dict(policy=OwnForwardPolicy),
+    "own extractor": dict(policy_kwargs=dict(features_extractor_class=NormalisedExtractor)),
+    "IMPALA": dict(policy=ImpalaPolicy, env=RandomEnv(observation_space=spaces.Box(0, 255, (64, 64, 3), np.uint8))),
+}
+
+
+def make(policy="MlpPolicy", env=None, algorithm=PPO, **arguments):
+    return algorithm(policy, env or RandomEnv(), **{**PPO_SETTINGS, **arguments})
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("arguments", PLAIN.values(), ids=PLAIN)
+def test_same_results_to_the_bit(arguments, deterministic):
+    model = make(**arguments)
+    assert is_plain(model.policy)
+    for n_envs in (1, 5):
+        space = model.observation_space
+        obs = th.as_tensor(np.stack([space.sample() for _ in range(n_envs)]))
+        results = []
+        for forward in (model.policy.forward, LeanForward(model.policy)):
+            th.manual_seed(0)
+            if model.use_sde:
+                model.policy.reset_noise(n_envs)
+            with th.no_grad():
+                results.append([*forward(obs, deterministic=deterministic), th.get_rng_state()])
+        for one, other in zip(*results, strict=True):
+            assert one.shape == other.shape and th.equal(one, other)
+
+
+@pytest.mark.parametrize("arguments", OTHERS.values(), ids=OTHERS)
+def test_other_policies_stay(arguments):
+    model = make(**arguments)
+    with lean_forward(model.policy):
+        assert "forward" not in vars(model.policy)
+
+
+def test_compiled_and_changed_policies_stay():
+    model = make()
+    with lean_forward(th.compile(model.policy, backend="eager")):
+        assert "forward" not in vars(model.policy)
+    own = model.policy.forward = lambda *args: ActorCriticPolicy.forward(model.policy, *args)
+    with lean_forward(model.policy):
+        assert model.policy.forward is own
+
+
+class InRollouts(BaseCallback):
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def _on_step(self):
+        self.function(self.model)
+        return True
+
+
+@pytest.mark.parametrize("lean", [True, False])
+def test_rollouts_of_cchain_ppo(lean):
+    seen = []
+    model = make(algorithm=CChainPPO, lean=lean)
+    model.learn(64, InRollouts(lambda model: seen.append(isinstance(model.policy.forward, LeanForward))))
+    assert seen == [lean] * 64
+    assert "forward" not in vars(model.policy)
+
+
+def test_nothing_stays_when_training_is_interrupted():
+    def interrupt(model):
+        raise KeyboardInterrupt
+
+    model = make(algorithm=CChainPPO)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, InRollouts(interrupt))
+    assert "forward" not in vars(model.policy)
+
+
+def test_hooks_are_called():
+    n_calls = []
+    model = make(algorithm=CChainPPO)
+    model.policy.action_net.register_forward_hook(lambda *_: n_calls.append(1))
+    model.learn(32)
+    assert len(n_calls) >= 32
+
+
+def test_layers_put_in_place_between_rollouts():
+    model = make(algorithm=CChainPPO).learn(32)
+    with th.no_grad():
+        model.policy.mlp_extractor.policy_net = nn.Sequential(nn.Linear(4, 64), nn.ReLU())
+    obs = th.randn(3, 4)
+    with lean_forward(model.policy), th.no_grad():
+        assert th.equal(model.policy(obs, deterministic=True)[1], model.policy.predict_values(obs))
+        lean = model.policy(obs, deterministic=True)[2]
+    assert th.equal(lean, model.policy(obs, deterministic=True)[2])
+
+
+def test_copy_of_a_model_in_a_rollout_acts_by_itself():
+    copies = []
+    model = make(algorithm=CChainPPO)
+    model.learn(32, InRollouts(lambda model: copies.append(copy.deepcopy(model.policy)) if not copies else None))
+    (policy,) = copies
+    with th.no_grad():
+        for parameter in policy.parameters():
+            parameter.zero_()
+        assert policy(th.ones(1, 4))[1] == 0
+    assert differ(model, make())
