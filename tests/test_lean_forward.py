@@ -13,7 +13,7 @@ from torch import nn
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
-from sb3_cchain.networks.lean_forward import LeanForward, is_plain, lean_forward
+from sb3_cchain.networks.lean_forward import LeanForward, has_plain_forward, lean_forward
 from tests.churn_models import ACTION_SPACES, DICT, IMAGE, PPO_SETTINGS, NormalisedExtractor, differ
 from tests.envs import RandomEnv
 
@@ -55,7 +55,7 @@ def make(policy="MlpPolicy", env=None, algorithm=PPO, **arguments):
 @pytest.mark.parametrize("arguments", PLAIN.values(), ids=PLAIN)
 def test_same_results_to_the_bit(arguments, deterministic):
     model = make(**arguments)
-    assert is_plain(model.policy)
+    assert has_plain_forward(model.policy)
     for n_envs in (1, 5):
         space = model.observation_space
         obs = th.as_tensor(np.stack([space.sample() for _ in range(n_envs)]))

@@ -12,6 +12,7 @@ from sb3_cchain.churn import ChurnReducer, component_backward
 from sb3_cchain.churn.gradient import carrying
 from sb3_cchain.networks.joint_evaluation import evaluate_jointly
 from sb3_cchain.networks.policy_inputs import n_observations, rows
+from sb3_cchain.networks.policy_networks import networks_of
 from sb3_cchain.networks.policy_outputs import of_action_net
 from sb3_cchain.replaced import replaced
 
@@ -47,16 +48,17 @@ def joint_passes(
     :param references: Where its reference batches come from
     :return: What completes an update, to be called right after ``zero_grad()``
     """
+    networks = networks_of(policy)
     coef = reducer.coefficient.value
     churn_loss: th.Tensor | None = None
 
     def evaluate_actions(observations: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         nonlocal churn_loss
         if reducer.reference is None:
-            return evaluate_jointly(policy, observations, actions)[:3]
+            return evaluate_jointly(networks, observations, actions)[:3]
         assert reducer.old_outputs is not None
         further = rows(reducer.reference, slice(references.n_shared, None))
-        values, log_prob, entropy, outputs = evaluate_jointly(policy, observations, actions, further)
+        values, log_prob, entropy, outputs = evaluate_jointly(networks, observations, actions, further)
         # The reference batch begins with the minibatch, or comes after it
         start = 0 if references.n_shared else n_observations(observations)
         due = outputs[start : start + len(reducer.old_outputs)]
@@ -68,7 +70,9 @@ def joint_passes(
         if churn_loss is not None:
             reducer.record(churn_loss)
             churn_loss = None
-        reducer.remember(references.current)
+        with th.no_grad():
+            outputs = networks.outputs(networks.latent(networks.actor_features(references.current)))
+            reducer.remember(references.current, of_action_net(policy, outputs))
 
     with replaced(policy, "evaluate_actions", evaluate_actions):
         yield complete

@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_cchain.networks.policy_inputs import joined, n_observations
+from sb3_cchain.networks.policy_networks import PolicyNetworks
 from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution, has_training_mode
 
 
@@ -44,26 +45,23 @@ def has_convolutions(policy: ActorCriticPolicy) -> bool:
 
 
 def evaluate_jointly(
-    policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None = None
+    networks: PolicyNetworks, observations: PyTorchObs, actions: th.Tensor, further: PyTorchObs | None = None
 ) -> Evaluation:
     """
-    :param policy: An actor-critic policy, of which ``can_evaluate_jointly()`` is true
+    :param networks: Those of a policy, of which ``can_evaluate_jointly()`` is true
     :param observations: Observations of the minibatch
     :param actions: Its actions
     :param further: Observations that go through the actor only; None, or an empty batch, for none
     :return: The evaluation of the minibatch, and the actor's outputs on both
     """
-    n = n_observations(observations)
+    policy, n = networks.policy, n_observations(observations)
     together = observations
     if further is not None and n_observations(further) > 0:
         together = joined(observations, further)
-    actor_features = BasePolicy.extract_features(policy, together, policy.pi_features_extractor)
-    if policy.share_features_extractor:
-        critic_features = actor_features[:n]
-    else:
-        critic_features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
-    latent = policy.mlp_extractor.forward_actor(actor_features)
-    outputs = policy.action_net(latent)
+    features = networks.actor_features(together)
+    latent = networks.latent(features)
+    outputs = networks.outputs(latent)
     distribution = distribution_of(policy, latent[:n], outputs[:n])
-    values = policy.value_net(policy.mlp_extractor.forward_critic(critic_features))
+    shared = policy.share_features_extractor
+    values = networks.values(features[:n] if shared else networks.critic_features(observations))
     return Evaluation(values, distribution.log_prob(actions), distribution.entropy(), outputs)

@@ -20,6 +20,7 @@ from torch.distributions import Bernoulli, Categorical
 from torch.nn import functional as F
 
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.policy_networks import PolicyNetworks
 
 # Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
 _MODE_FREE_PACKAGES = (
@@ -50,8 +51,8 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
     if has_own_distribution(type(uncompiled(policy))):
         return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
-    features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
-    return of_action_net(policy, policy.action_net(policy.mlp_extractor.forward_actor(features)))
+    networks = PolicyNetworks(policy)
+    return of_action_net(policy, networks.outputs(networks.latent(networks.actor_features(observations))))
 
 
 def of_action_net(policy: ActorCriticPolicy, outputs: th.Tensor) -> th.Tensor:

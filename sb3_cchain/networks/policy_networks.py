@@ -1,0 +1,118 @@
+"""The networks of an SB3 actor-critic policy, as functions of observations."""
+
+from collections.abc import Callable
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+
+class PolicyNetworks:
+    """
+    :param policy: An actor-critic policy that extracts features as SB3's do
+    """
+
+    def __init__(self, policy: ActorCriticPolicy):
+        self.policy = policy
+
+    def actor_features(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :param observations: Batch of observations
+        :return: What ``latent()`` takes
+        """
+        return BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+
+    def critic_features(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :param observations: Batch of observations
+        :return: What ``values()`` takes; the actor's features where ``policy.share_features_extractor``
+        """
+        return BasePolicy.extract_features(self.policy, observations, self.policy.vf_features_extractor)
+
+    def latent(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: Features of the actor
+        :return: What ``outputs()`` takes
+        """
+        return self.policy.mlp_extractor.forward_actor(features)
+
+    def outputs(self, latent: th.Tensor) -> th.Tensor:
+        """
+        :param latent: Activations of the actor's last hidden layer
+        :return: Outputs of ``policy.action_net``, which the action distribution is made of
+        """
+        return self.policy.action_net(latent)
+
+    def values(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: Features of the critic
+        :return: State values ``(batch_size, 1)``
+        """
+        return self.policy.value_net(self.policy.mlp_extractor.forward_critic(features))
+
+
+class PlainNetworks(PolicyNetworks):
+    """
+    The same operations, with layers that are called by their ``forward()``. In a small network, what ``nn.Module.__call__()``
+    does beside it, above all looking for hooks, takes about as long as the layers.
+
+    :param policy: A policy, of which ``is_plain()`` is true
+    """
+
+    def __init__(self, policy: ActorCriticPolicy):
+        super().__init__(policy)
+        self._actor = _layers(policy.mlp_extractor.policy_net)
+        self._critic = [*_layers(policy.mlp_extractor.value_net), policy.value_net.forward]
+        self.outputs = policy.action_net.forward  # type: ignore[method-assign]
+
+    def actor_features(self, observations: PyTorchObs) -> th.Tensor:
+        """As of the base class."""
+        assert th.is_tensor(observations)
+        return observations.float().flatten(start_dim=1)
+
+    critic_features = actor_features
+
+    def latent(self, features: th.Tensor) -> th.Tensor:
+        """As of the base class."""
+        for layer in self._actor:
+            features = layer(features)
+        return features
+
+    def values(self, features: th.Tensor) -> th.Tensor:
+        """As of the base class."""
+        for layer in self._critic:
+            features = layer(features)
+        return features
+
+
+def _layers(network: nn.Module) -> list[Callable[[th.Tensor], th.Tensor]]:
+    assert isinstance(network, nn.Sequential)
+    return [layer.forward for layer in network]
+
+
+def is_plain(policy: nn.Module) -> bool:
+    """
+    :param policy: A policy
+    :return: Whether it is an actor-critic policy of SB3 that takes vectors and has MLPs for actor and critic, without hooks
+    """
+    return (
+        isinstance(policy, ActorCriticPolicy)  # not so when compiled
+        and type(policy).extract_features is ActorCriticPolicy.extract_features
+        and isinstance(policy.observation_space, spaces.Box)
+        and not is_image_space(policy.observation_space)
+        and type(policy.features_extractor) is FlattenExtractor
+        and type(policy.mlp_extractor) is MlpExtractor
+        and not any(module._forward_pre_hooks or module._forward_hooks for module in policy.modules())
+    )
+
+
+def networks_of(policy: ActorCriticPolicy) -> PolicyNetworks:
+    """
+    :param policy: An actor-critic policy that extracts features as SB3's do
+    :return: Its networks, as long as its layers are not replaced and get no hooks
+    """
+    return PlainNetworks(policy) if is_plain(policy) else PolicyNetworks(policy)
