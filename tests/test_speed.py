@@ -18,6 +18,8 @@ from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
+from benchmarks.speed.update_parts import PARTS, parts_of_an_update, parts_table
+from sb3_cchain import CChainPPO
 from sb3_cchain.methods.registry import REGISTRY
 
 # Two updates of tiny networks
@@ -193,3 +195,21 @@ def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
     assert sorted(places) == sorted(["made_with", *speed.CASES, *speed.OTHERS])
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
+
+
+def test_parts_of_an_update():
+    model = CChainPPO(**model_settings("ppo_cchain", "Continual/CartPole-v1", **TINY)).learn(32)
+    before = th.Tensor.backward, th.nn.utils.clip_grad_norm_, dict(vars(model.policy)), dict(vars(model.policy.optimizer))
+    parts = parts_of_an_update(model)
+    assert all(seconds > 0 for seconds in parts.values())
+    assert parts.pop("all") == pytest.approx(sum(parts.values()))
+    assert before[:2] == (th.Tensor.backward, th.nn.utils.clip_grad_norm_)
+    assert before[2:] == (vars(model.policy), vars(model.policy.optimizer))
+
+
+def test_table_of_the_parts():
+    table = parts_table(n_rounds=1, **TINY)
+    assert [row[0] for row in table.rows] == [*PARTS, "everything else", "all"]
+    # Only C-CHAIN has reference batches
+    (reference,) = (row[1:] for row in table.rows if row[0] == PARTS[-1])
+    assert reference[:2] == ["0", "0"] and all(int(cell) > 0 for cell in reference[2:])

@@ -133,8 +133,7 @@ def minatar(n_past_updates: int = 0) -> Case:
 
 CASES: dict[str, Callable[[], Case]] = {
     "gym_control": partial(ppo, "Continual/Acrobot-v1", partial(matrix_product, 32, 256, 256), n_rounds=15),
-    # A quarter of the rollout
-    "dmc": partial(ppo, "Continual/Walker-v0", partial(matrix_product, 64, 256, 256), n_rounds=8, n_steps=512),
+    "dmc": partial(ppo, "Continual/Walker-v0", partial(matrix_product, 64, 256, 256), n_rounds=5),
     # One epoch. SBX has the Nature CNN only
     "procgen": partial(
         ppo, "Continual/Starpilot-v0", partial(convolution, 125, 32, 16, 32), n_rounds=3, sbx=False, n_epochs=1
