@@ -18,9 +18,10 @@ from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
-from benchmarks.speed.update_parts import PARTS, parts_of_an_update, parts_table
+from benchmarks.speed.update_parts import PARTS, parts_of_an_update, parts_table, watched
 from sb3_cchain import CChainPPO
 from sb3_cchain.methods.registry import REGISTRY
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
 
 # Two updates of tiny networks
 TINY = dict(n_steps=16, batch_size=8, n_epochs=1, policy_kwargs=dict(net_arch=[8], activation_fn=nn.ReLU))
@@ -200,6 +201,8 @@ def test_each_table_has_one_place_in_the_documentation():
 def test_parts_of_an_update():
     model = CChainPPO(**model_settings("ppo_cchain", "Continual/CartPole-v1", **TINY)).learn(32)
     before = th.Tensor.backward, th.nn.utils.clip_grad_norm_, dict(vars(model.policy)), dict(vars(model.policy.optimizer))
+    with watched(model):
+        assert can_evaluate_jointly(model.policy)  # as when nobody watches
     parts = parts_of_an_update(model)
     assert all(seconds > 0 for seconds in parts.values())
     assert parts.pop("all") == pytest.approx(sum(parts.values()))

@@ -28,14 +28,14 @@ def watched(model: PPO) -> Iterator[dict[str, TimeInside]]:
     :param model: A model
     :return: The time inside each of ``PARTS``, while the ``with`` block lasts
     """
+    with_churn = isinstance(model, CChainPPO)
     inside = {part: TimeInside() for part in PARTS}
     owners: list[tuple[str, Any, str]] = [
         (BACKWARD, th.Tensor, "backward"),
         (CLIP, th.nn.utils, "clip_grad_norm_"),
         (ADAM, model.policy.optimizer, "step"),
-        # What CChainPPO puts in the place of `policy.evaluate_actions()` calls the function below
-        (FORWARD, model.policy, "evaluate_actions"),
-        (FORWARD, reference_passes, "evaluate_jointly"),
+        # CChainPPO puts this in the place of `policy.evaluate_actions()`
+        (FORWARD, *((reference_passes, "evaluate_jointly") if with_churn else (model.policy, "evaluate_actions"))),
     ]
 
     def timed_extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) -> Any:
