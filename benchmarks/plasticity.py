@@ -8,8 +8,8 @@ writes a table and a picture. The same command goes on where it was interrupted.
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 
+from benchmarks.grid.arguments import add_variant_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.run import Run, make_run, shipped_hyperparameters, suite_methods
 from benchmarks.grid.suites import SUITES
@@ -51,12 +51,7 @@ def main() -> None:
     """Parse the command line, train, write and print the table and the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="Continual/Acrobot-v1", choices=SUITES[SUITE].env_ids, help="Environment id")
-    parser.add_argument("--variants", nargs="+", default=list(LINES), choices=list(LINES), help="What is compared")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="Seeds of agents and of the offsets")
-    parser.add_argument("--n-tasks", type=int, default=4, help="Length of the task sequence")
-    parser.add_argument("--steps-per-task", type=int, default=32_000, help="Environment steps per task")
-    parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
-    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
+    add_variant_arguments(parser, LINES, seeds=[0, 1], n_tasks=4, steps_per_task=32_000)
     args = parser.parse_args()
 
     try:

@@ -8,8 +8,8 @@ trains, and writes a table and learning curves for each environment. The same co
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
+from benchmarks.grid.arguments import add_variant_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import Run, make_run, suite_methods
@@ -62,12 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     environments = ["Continual/Acrobot-v1", "Continual/LunarLander-v3"]
     parser.add_argument("--env", nargs="+", default=environments, choices=SUITES[SUITE].env_ids, help="Environment ids")
-    parser.add_argument("--variants", nargs="+", default=list(LINES), choices=list(LINES), help="What is compared")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3], help="Seeds of agents and of the offsets")
-    parser.add_argument("--n-tasks", type=int, default=4, help="Length of the task sequence")
-    parser.add_argument("--steps-per-task", type=int, default=64_000, help="Environment steps per task")
-    parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
-    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
+    add_variant_arguments(parser, LINES, seeds=[0, 1, 2, 3], n_tasks=4, steps_per_task=64_000)
     args = parser.parse_args()
 
     try:

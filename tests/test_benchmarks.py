@@ -1,4 +1,4 @@
-"""The commands ``demo``, ``compare`` and ``plasticity``, with a training command that starts at once."""
+"""The commands ``demo``, ``compare``, ``plasticity`` and ``references``, with a training command that starts at once."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from benchmarks import compare, demo, plasticity
+from benchmarks import compare, demo, plasticity, references
 from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, make_run
@@ -81,6 +81,24 @@ def test_what_the_variants_differ_in():
     for name, (callbacks, *others) in overrides.items():
         assert "'sb3_cchain.TaskSync'" in callbacks and callbacks.endswith("'sb3_cchain.analysis.NetworkHealth']")
         assert others == ([f"churn_component:'{name}'"] if name in ("projection", "orthogonal") else [])
+
+
+def test_references(run_command, tmp_path, capsys):
+    env_ids = ["Continual/Acrobot-v1", "Continual/CartPole-v1"]
+    folders = [f"references_2x800/gym_control/Continual-{name}" for name in ("Acrobot-v1", "CartPole-v1")]
+    assert run_command(references, [*LENGTH, "--seeds", "0", "--env", *env_ids]) == sorted(
+        f"{folder}/{name}/seed_0" for folder in folders for name in references.LINES
+    )
+    shown = capsys.readouterr().out
+    for folder in folders:
+        table = (tmp_path / "out" / folder / "table.md").read_text()
+        assert "| next | 0 | -10.0 | -20.0 | -15.0 |" in table and table in shown + "\n"
+        assert is_picture(tmp_path / "out" / folder / "curves.png")
+
+
+def test_what_the_references_differ_in():
+    overrides = {name: references.variant_run(name, "Continual/Acrobot-v1", 0, 2, 800).overrides for name in references.LINES}
+    assert overrides == {"independent": (), "next": ("churn_reference:'next'",), "half": ("churn_batch_size:0.5",)}
 
 
 def test_a_failed_run_names_its_log_and_ends_the_command(run_command, tmp_path):
