@@ -18,7 +18,7 @@ from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
-from benchmarks.speed.update_parts import PARTS, parts_of_an_update, parts_table, watched
+from benchmarks.speed.update_parts import PARTS, REFERENCE, dqn_parts, parts_of_an_update, ppo_parts, watched
 from sb3_cchain import CChainPPO
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
@@ -198,21 +198,26 @@ def test_each_table_has_one_place_in_the_documentation():
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
 
 
-def test_parts_of_an_update():
-    model = CChainPPO(**model_settings("ppo_cchain", "Continual/CartPole-v1", **TINY)).learn(32)
+@pytest.mark.parametrize("algorithm, algo", [(PPO, "ppo"), (CChainPPO, "ppo_cchain")])
+def test_parts_of_an_update(algorithm, algo):
+    model = algorithm(**model_settings(algo, "Continual/CartPole-v1", **TINY)).learn(32)
     before = th.Tensor.backward, th.nn.utils.clip_grad_norm_, dict(vars(model.policy)), dict(vars(model.policy.optimizer))
-    with watched(model):
-        assert can_evaluate_jointly(model.policy)  # as when nobody watches
-    parts = parts_of_an_update(model)
+    if algorithm is CChainPPO:
+        with watched(model):
+            assert can_evaluate_jointly(model.policy)  # as when nobody watches
+    parts = parts_of_an_update(model, model.train, n_updates=2)
+    # Only C-CHAIN has reference batches
+    assert (parts.pop(REFERENCE) > 0) == (algorithm is CChainPPO)
     assert all(seconds > 0 for seconds in parts.values())
-    assert parts.pop("all") == pytest.approx(sum(parts.values()))
     assert before[:2] == (th.Tensor.backward, th.nn.utils.clip_grad_norm_)
     assert before[2:] == (vars(model.policy), vars(model.policy.optimizer))
 
 
-def test_table_of_the_parts():
-    table = parts_table(n_rounds=1, **TINY)
+def test_tables_of_the_parts():
+    table = ppo_parts(n_rounds=1, **TINY)
     assert [row[0] for row in table.rows] == [*PARTS, "everything else", "all"]
-    # Only C-CHAIN has reference batches
-    (reference,) = (row[1:] for row in table.rows if row[0] == PARTS[-1])
-    assert reference[:2] == ["0", "0"] and all(int(cell) > 0 for cell in reference[2:])
+    total = [sum(int(row[column]) for row in table.rows[:-1]) for column in range(1, 5)]
+    assert total == pytest.approx([int(cell) for cell in table.rows[-1][1:]], abs=len(PARTS))
+    table = dqn_parts(n_rounds=1, n_updates=2, buffer_size=100, learning_starts=10)
+    assert table.header == ["", "DoubleDQN", "CChainDQN"] and REFERENCE not in {row[0] for row in table.rows}
+    assert all(int(cell) > 0 for row in table.rows for cell in row[1:])
