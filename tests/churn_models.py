@@ -1,7 +1,9 @@
 """Tiny models of each form of churn reduction. A further algorithm with churn reduction needs a row in ``FORMS``."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
 from sb3_cchain.algorithms.churn_state import ChurnState
+from sb3_cchain.networks import policy_outputs
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -96,7 +99,17 @@ def learn_in_double_precision(make, n_timesteps, env="CartPole-v1", policy="MlpP
     arguments["policy_kwargs"] = {"net_arch": [16], **(policy_kwargs or {}), "features_extractor_class": extractor}
     model = make(policy, env, **arguments)
     model.policy.double()
-    return model.learn(n_timesteps)
+    # These extractors act in training as in evaluation, as those of SB3 do
+    packages = (*policy_outputs._MODE_FREE_PACKAGES, extractor.__module__)
+    with patch.object(policy_outputs, "_MODE_FREE_PACKAGES", packages):
+        return model.learn(n_timesteps)
+
+
+@contextmanager
+def spied(module, name):
+    """A mock that does what the function does."""
+    with patch.object(module, name, Mock(wraps=getattr(module, name))) as spy:
+        yield spy
 
 
 def churn_keys(model):

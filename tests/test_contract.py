@@ -15,7 +15,7 @@ from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.algorithms import dqn_cchain, on_policy
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import policy_outputs
-from tests.churn_models import assert_close, assert_equal, differ, learn_in_double_precision
+from tests.churn_models import assert_close, assert_equal, differ, learn_in_double_precision, spied
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, PPO_SETTINGS, rewritten
 
 # --- PPO -------------------------------------------------------------------------------------------------------------------
@@ -95,13 +95,15 @@ def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, 
 @each_reference
 def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, target_kl, churn_reference, churn_batch_size):
     settings = dict(PPO_SETTINGS, target_kl=target_kl)
-    written_out, seam = (
-        learn_in_double_precision(make, 64 * N_ITERATIONS, env_id, **settings)
-        for make in (
-            written_out_ppo(churn_reference, churn_batch_size),
-            partial(CChainPPO, churn_coef=COEF, churn_reference=churn_reference, churn_batch_size=churn_batch_size),
+    with spied(on_policy, "joint_passes") as joint:
+        written_out, seam = (
+            learn_in_double_precision(make, 64 * N_ITERATIONS, env_id, **settings)
+            for make in (
+                written_out_ppo(churn_reference, churn_batch_size),
+                partial(CChainPPO, churn_coef=COEF, churn_reference=churn_reference, churn_batch_size=churn_batch_size),
+            )
         )
-    )
+    assert joint.call_count == N_ITERATIONS
     assert written_out.n_optimizer_steps >= 100, written_out.n_optimizer_steps
     assert_close(seam, written_out, atol=1e-12)
 
@@ -112,7 +114,9 @@ def test_ppo_equals_a_loop_that_copies_the_network(env_id, target_churn_ratio, c
     arguments = dict(target_churn_ratio=target_churn_ratio, churn_warmup=2, churn_window=5, **PPO_SETTINGS)
     arguments.update(churn_reference=churn_reference, churn_batch_size=churn_batch_size)
     copying = learn_in_double_precision(DeepCopyPPO, 64 * 13, env_id, **arguments)
-    seam = learn_in_double_precision(CChainPPO, 64 * 13, env_id, **arguments)
+    with spied(on_policy, "joint_passes") as joint:
+        seam = learn_in_double_precision(CChainPPO, 64 * 13, env_id, **arguments)
+    assert joint.call_count == 13
     assert seam.policy.optimizer.state_dict()["state"][0]["step"] == 13 * 16 >= 200
     assert_close(seam, copying, atol=1e-9)
     # λ had adapted
@@ -203,7 +207,9 @@ def test_dqn_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max_gra
     else:
         # Batches of twice the size are summed in another order
         reference = learn_in_double_precision(written_out, N_STEPS, **arguments)
-        model = learn_in_double_precision(cchain, N_STEPS, **arguments)
+        with spied(dqn_cchain, "joint_pass") as joint:
+            model = learn_in_double_precision(cchain, N_STEPS, **arguments)
+        assert joint.call_count == 220
         assert_close(model, reference, atol=1e-9)
     assert reference.n_churn_terms == 219  # the first update has no previous one
     vanilla = without_churn_reduction(DoubleDQN, double_q=double_q, loss=loss, max_grad_norm=max_grad_norm)

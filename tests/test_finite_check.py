@@ -170,6 +170,13 @@ def test_names_the_parameter(make, callbacks, action_space, value):
         model.learn(32 * 4, [SpoilOnce(value), *(callback() for callback in callbacks)])
 
 
+@each_policy_form
+def test_names_the_parameter_after_the_last_update(make, callbacks):
+    model = make(RandomEnv())
+    with pytest.raises(ValueError, match=r"parameter action_net.weight holds NaN or infinite values at step 32 of training"):
+        model.learn(32, [SpoilOnce(np.nan, n_rollouts=1), *(callback() for callback in callbacks)])
+
+
 @pytest.mark.filterwarnings("ignore:invalid value")
 @each_policy_form
 def test_outputs_that_are_too_large(make, callbacks):

@@ -145,6 +145,13 @@ def test_same_training_with_churn_reduction(action_space):
 # --- Where nothing changes -------------------------------------------------------------------------------------------------
 
 
+class AssigningPolicy(ActorCriticPolicy):
+    def get_distribution(self, obs):
+        distribution = super().get_distribution(obs)
+        distribution.distribution = th.distributions.Categorical(logits=2 * distribution.distribution.logits)
+        return distribution
+
+
 class OwnDistributionPolicy(ActorCriticPolicy):
     def _get_action_dist_from_latent(self, latent_pi):
         return self.action_dist.proba_distribution(2 * self.action_net(latent_pi))
@@ -154,10 +161,11 @@ class OwnDistributionPolicy(ActorCriticPolicy):
     "algorithm, policy, arguments",
     [
         (PPO, OwnDistributionPolicy, {}),
+        (PPO, AssigningPolicy, {}),
         (PPO, "MlpPolicy", dict(use_sde=True, env=RandomEnv(action_space=ACTION_SPACES[3]))),
         (MaskablePPO, "MlpPolicy", {}),
     ],
-    ids=["own distribution", "gSDE", "maskable"],
+    ids=["own distribution", "assigned distribution", "gSDE", "maskable"],
 )
 def test_other_distributions_stay(algorithm, policy, arguments):
     model = algorithm(policy, **{"env": RandomEnv(), "device": "cpu", **arguments})

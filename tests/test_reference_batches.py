@@ -1,16 +1,20 @@
 """Where CChainPPO's reference batches come from, and that they go through the policy with the minibatches."""
 
+from contextlib import nullcontext
 from itertools import pairwise
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.algorithms import on_policy, reference_batches
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
+from sb3_cchain.networks import policy_networks
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
@@ -20,6 +24,7 @@ from tests.churn_models import (
     assert_equal,
     churn_keys,
     learn_in_double_precision,
+    spied,
 )
 from tests.envs import RandomEnv
 
@@ -115,10 +120,8 @@ def test_buffers_are_read_in_the_same_order(kind, size, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
-@pytest.mark.parametrize("limit", [0, 2**24])
-@pytest.mark.parametrize("buffer_class", [None, DictRolloutBuffer, OwnDictBuffer])
+@pytest.mark.parametrize("buffer_class, limit", [(DictRolloutBuffer, 0), (OwnDictBuffer, 2**24)])
 def test_dict_observations(buffer_class, limit, monkeypatch):
-    monkeypatch.setattr(reference_batches, "HELD_AT_MOST", limit)
     env = RandomEnv(observation_space=DICT)
     models = [
         CChainPPO(
@@ -126,11 +129,28 @@ def test_dict_observations(buffer_class, limit, monkeypatch):
         )
         for each in (None, buffer_class)
     ]
-    for model in models:
+    for model, held_at_most in zip(models, (2**24, limit), strict=True):
+        monkeypatch.setattr(reference_batches, "HELD_AT_MOST", held_at_most)
         model.set_random_seed(0)
         model.learn(72, log_interval=10**6)
         assert_churn_was_reduced(model)
     assert_equal(*models)
+
+
+class CentringBuffer(RolloutBuffer):
+    """Gathers its minibatches in its own way."""
+
+    def _get_samples(self, batch_inds, env=None):
+        samples = super()._get_samples(batch_inds, env)
+        return samples._replace(advantages=samples.advantages - samples.advantages.mean())
+
+
+def test_minibatches_are_gathered_as_the_buffer_does():
+    model = CChainPPO("MlpPolicy", RandomEnv(), rollout_buffer_class=CentringBuffer, n_steps=32, batch_size=8, device="cpu")
+    model.learn(32)
+    minibatches = list(ReferenceBatches(model.rollout_buffer).get(8))
+    assert len(minibatches) == 4
+    assert all(abs(minibatch.advantages.mean()) < 1e-6 for minibatch in minibatches)
 
 
 # --- How they go through the policy ------------------------------------------------------------------------------------------
@@ -150,11 +170,12 @@ FORMS_OF_POLICY = {
 }
 
 
-def learn(env, jointly, monkeypatch, **arguments):
-    with monkeypatch.context() as patch:
-        if not jointly:
-            patch.setattr(on_policy, "can_evaluate_jointly", lambda policy: False)
-        return learn_in_double_precision(CChainPPO, 64 * N_ITERATIONS, env(), **{**SETTINGS, **arguments})
+def learn(env, jointly, **arguments):
+    with spied(on_policy, "joint_passes") as joint, spied(on_policy, "separate_passes") as separate:
+        with nullcontext() if jointly else patch.object(on_policy, "can_evaluate_jointly", lambda policy: False):
+            model = learn_in_double_precision(CChainPPO, 64 * N_ITERATIONS, env(), **{**SETTINGS, **arguments})
+    assert (joint.call_count, separate.call_count) == ((N_ITERATIONS, 0) if jointly else (0, N_ITERATIONS))
+    return model
 
 
 @pytest.mark.parametrize(
@@ -164,29 +185,47 @@ def learn(env, jointly, monkeypatch, **arguments):
         *((form, *reference) for form in FORMS_OF_POLICY if form != "Discrete" for reference in REFERENCES[::3]),
     ],
 )
-def test_joint_passes_make_the_same_updates(form, kind, size, monkeypatch):
+def test_joint_passes_make_the_same_updates(form, kind, size):
     arguments = dict(FORMS_OF_POLICY[form], churn_reference=kind, churn_batch_size=size, churn_warmup=2)
-    check_same_updates(monkeypatch, arguments)
-
-
-@pytest.mark.parametrize("kind, jointly", [("independent", False), ("next", True)])
-def test_convolutions_see_one_batch_after_the_other(kind, jointly):
-    env = RandomEnv(observation_space=IMAGE)
-    model = CChainPPO("CnnPolicy", env, churn_reference=kind, n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
-    sizes = []
-    model.learn(16)
-    model.policy.features_extractor.register_forward_hook(
-        lambda module, inputs, output: sizes.append(len(output)) if th.is_grad_enabled() else None
-    )
-    model.train()
-    # Of the first update, whose reference batch is one of the rollout before, and of the second
-    assert sizes == ([16, 8] if jointly else [8, 8, 8, 8])
-
-
-def check_same_updates(monkeypatch, arguments):
-    joint, separate = (learn(jointly=jointly, monkeypatch=monkeypatch, **arguments) for jointly in (True, False))
+    joint, separate = (learn(jointly=jointly, **arguments) for jointly in (True, False))
     assert joint.policy.optimizer.state_dict()["state"][0]["step"] == 200
     assert_close(joint, separate, atol=1e-12)
     assert_churn_was_reduced(joint)
     for key in churn_keys(joint):
         assert joint.logger.name_to_value[key] == pytest.approx(separate.logger.name_to_value[key], rel=1e-6), key
+
+
+@pytest.mark.parametrize("kind, jointly", [("independent", False), ("next", True)])
+def test_convolutions_see_one_batch_after_the_other(kind, jointly):
+    settings = dict(n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+    model = CChainPPO("CnnPolicy", RandomEnv(observation_space=IMAGE), churn_reference=kind, **settings)
+    with spied(on_policy, "joint_passes") as joint:
+        assert_churn_was_reduced(model.learn(32))
+    assert joint.called == jointly
+
+
+@pytest.mark.parametrize("register", ["register_forward_hook", "register_forward_pre_hook", "register_full_backward_hook"])
+def test_hooks_see_what_they_see_in_ppo(register):
+    """Minibatches alone, and each backward pass of PPO's loss."""
+
+    def sizes(algorithm, **arguments):
+        seen = []
+        settings = dict(n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+        model = algorithm("MlpPolicy", RandomEnv(), **settings, **arguments).learn(16)
+        getattr(model.policy.action_net, register)(lambda *_: seen.append(th.is_grad_enabled()))
+        model.train()
+        return len(seen)
+
+    # With C-CHAIN, the reference batch before, and the outputs of the one after, come to each update
+    n_passes = {"register_full_backward_hook": 2}.get(register, 3)
+    assert sizes(CChainPPO) == n_passes * sizes(PPO)
+
+
+def test_direct_calls_of_layers_make_the_same_updates():
+    models = []
+    for plain in (True, False):
+        with nullcontext() if plain else patch.object(policy_networks, "is_plain", lambda policy: False):
+            model = CChainPPO("MlpPolicy", RandomEnv(), lean=False, **SETTINGS).learn(64 * 3)
+        assert_churn_was_reduced(model)
+        models.append(model)
+    assert_equal(*models)

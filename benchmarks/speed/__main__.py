@@ -59,7 +59,9 @@ def main() -> None:
     names = [*CASES, *OTHERS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", nargs="+", default=names, choices=names, help="What to measure")
-    parser.add_argument("--rounds", type=int, help="Timings of each, instead of each case's own number")
+    parser.add_argument(
+        "--rounds", type=int, help="Timings of each model in the cases that compare models, instead of their own number"
+    )
     parser.add_argument("--write", action="store_true", help="Put the tables into their places in docs/")
     args = parser.parse_args()
     th.set_num_threads(1)

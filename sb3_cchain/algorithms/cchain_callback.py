@@ -140,3 +140,4 @@ class CChainCallback(FiniteCheck):
 
     def _on_training_end(self) -> None:
         self._replaced.close()
+        super()._on_training_end()

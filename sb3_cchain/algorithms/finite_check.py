@@ -18,7 +18,8 @@ FEW_VALUES = 100
 class FiniteCheck(BaseCallback):
     """
     Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked. Of
-    an on-policy algorithm it checks the parameters of the policy before each rollout, and what the policy gave after it.
+    an on-policy algorithm it checks the parameters of the policy before each rollout and at the end of training, and what the
+    policy gave after each rollout.
 
     Torch would raise an error, too, but later, and one that names neither the environment nor the step nor the parameter.
     """
@@ -46,6 +47,10 @@ class FiniteCheck(BaseCallback):
         if isinstance(self.model, OnPolicyAlgorithm):
             for name in ("actions", "log_probs", "values"):
                 self._check_outputs(name, getattr(self.model.rollout_buffer, name))
+
+    def _on_training_end(self) -> None:
+        if isinstance(self.model, OnPolicyAlgorithm):
+            self._check_parameters()
 
     def _check_parameters(self) -> None:
         for name, parameter in uncompiled(self.model.policy).named_parameters():

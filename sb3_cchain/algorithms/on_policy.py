@@ -119,6 +119,15 @@ class PolicyChurnOptions:
         check_number("churn_batch_size", self.churn_batch_size, minimum=0, exclusive=True)
 
 
+def _goes_jointly(policy: ActorCriticPolicy, options: PolicyChurnOptions) -> bool:
+    """Whether reference batches can go through the policy with the minibatches, and that takes less time."""
+    return (
+        options.churn_component == "full"
+        and (options.churn_reference == "next" or not has_convolutions(policy))
+        and can_evaluate_jointly(policy)
+    )
+
+
 @contextmanager
 def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions) -> Iterator[None]:
     """
@@ -160,8 +169,7 @@ def reduced_churn(model: PPO, reducer: ChurnReducer, options: PolicyChurnOptions
             add_gradient()
             old_values = values_of(references.current) if references.starts_epoch else None
 
-    pays = options.churn_reference == "next" or not has_convolutions(policy)
-    if pays and options.churn_component == "full" and can_evaluate_jointly(policy):
+    if _goes_jointly(policy, options):
         passes = joint_passes(policy, reducer, references)
     else:
         passes = separate_passes(policy, reducer, references, options.churn_component)

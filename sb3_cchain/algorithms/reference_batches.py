@@ -13,8 +13,8 @@ from sb3_cchain.replaced import replaced
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
 
-# Rollouts whose observations take at most this many bytes are gathered once per epoch, which holds them twice. Larger ones are
-# gathered minibatch by minibatch
+# Rollouts in SB3's buffers whose observations take at most this many bytes are gathered once per epoch, which holds them
+# twice. Larger ones are gathered minibatch by minibatch
 HELD_AT_MOST = 2**24
 
 
@@ -68,12 +68,20 @@ class ReferenceBatches:
             yield epoch.minibatch(position)
 
     def _draw_epoch(self, batch_size: int | None) -> "_HeldEpoch | _GatheredEpoch":
-        if getattr(self._get, "__func__", None) not in (RolloutBuffer.get, DictRolloutBuffer.get):
-            minibatches = list(self._get(batch_size))  # the buffer may make them in its own way
+        if not self._is_sb3s():
+            minibatches = list(self._get(batch_size))
             return _HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
         with replaced(self._buffer, "_get_samples", lambda indices, env=None: indices):
             epoch = _GatheredEpoch(self._buffer, list(self._get(batch_size)))
         return epoch.held() if self._n_bytes() <= HELD_AT_MOST else epoch
+
+    def _is_sb3s(self) -> bool:
+        """Whether the buffer draws and gathers minibatches as SB3's do."""
+        get, gather = (getattr(method, "__func__", None) for method in (self._get, self._buffer._get_samples))
+        return get in (RolloutBuffer.get, DictRolloutBuffer.get) and gather in (
+            RolloutBuffer._get_samples,
+            DictRolloutBuffer._get_samples,
+        )
 
     def _n_bytes(self) -> int:
         observations = self._buffer.observations

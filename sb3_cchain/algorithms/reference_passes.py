@@ -13,7 +13,7 @@ from sb3_cchain.churn.gradient import carrying
 from sb3_cchain.networks.joint_evaluation import evaluate_jointly
 from sb3_cchain.networks.policy_inputs import n_observations, rows
 from sb3_cchain.networks.policy_networks import networks_of
-from sb3_cchain.networks.policy_outputs import of_action_net
+from sb3_cchain.networks.policy_outputs import actor_outputs, of_action_net
 from sb3_cchain.replaced import replaced
 
 
@@ -71,8 +71,7 @@ def joint_passes(
             reducer.record(churn_loss)
             churn_loss = None
         with th.no_grad():
-            outputs = networks.outputs(networks.latent(networks.actor_features(references.current)))
-            reducer.remember(references.current, of_action_net(policy, outputs))
+            reducer.remember(references.current, actor_outputs(networks, references.current))
 
     with replaced(policy, "evaluate_actions", evaluate_actions):
         yield complete

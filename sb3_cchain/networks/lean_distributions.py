@@ -20,7 +20,6 @@ from stable_baselines3.common.distributions import (
     sum_independent_dims,
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.distributions import Bernoulli, Categorical, Normal
 from torch.nn import functional as F
 
@@ -60,10 +59,7 @@ class _Categorical:
         return -(finite * self.probs).sum(-1)
 
     def sample(self) -> th.Tensor:
-        try:
-            return th.multinomial(self.probs, 1, replacement=True).squeeze(-1)
-        except RuntimeError as error:
-            raise ValueError(NAN_OUTPUTS) from error
+        return th.multinomial(_without_nan(self.probs), 1, replacement=True).squeeze(-1)
 
     def mode(self) -> th.Tensor:
         return _without_nan(self.probs).argmax(dim=1)
@@ -77,11 +73,12 @@ class LeanCategorical(CategoricalDistribution):
         :param action_logits: Logits, ``(batch_size, n_actions)``
         :return: self
         """
+        self.__dict__.pop("distribution", None)
         self._action_logits = action_logits
         self._lean = _Categorical(action_logits)
         return self
 
-    @property
+    @cached_property
     def distribution(self) -> Categorical:  # type: ignore[override]
         """Torch's, as SB3 has it, made when it is asked for."""
         return Categorical(logits=self._action_logits)
@@ -120,11 +117,12 @@ class LeanMultiCategorical(MultiCategoricalDistribution):
         :param action_logits: Logits of all sub-actions, ``(batch_size, sum of their numbers of values)``
         :return: self
         """
+        self.__dict__.pop("distribution", None)
         self._action_logits = action_logits.split(list(self.action_dims), dim=1)
         self._lean = [_Categorical(logits) for logits in self._action_logits]
         return self
 
-    @property
+    @cached_property
     def distribution(self) -> list[Categorical]:  # type: ignore[override]
         """Torch's, as SB3 has them, made when they are asked for."""
         return [Categorical(logits=logits) for logits in self._action_logits]
@@ -166,10 +164,11 @@ class LeanBernoulli(BernoulliDistribution):
         :param action_logits: Logits, ``(batch_size, n_sub_actions)``
         :return: self
         """
+        self.__dict__.pop("distribution", None)
         self._action_logits = action_logits
         return self
 
-    @property
+    @cached_property
     def distribution(self) -> Bernoulli:  # type: ignore[override]
         """Torch's, as SB3 has it, made when it is asked for."""
         return Bernoulli(logits=self._action_logits)
@@ -192,10 +191,7 @@ class LeanBernoulli(BernoulliDistribution):
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
-        try:
-            return self._action_logits.detach().sigmoid().bernoulli()
-        except RuntimeError as error:
-            raise ValueError(NAN_OUTPUTS) from error
+        return _without_nan(self._action_logits.detach().sigmoid()).bernoulli()
 
     def mode(self) -> th.Tensor:
         """
@@ -213,11 +209,12 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :param log_std: Logarithms of the standard deviations, ``(action_dim,)``
         :return: self
         """
+        self.__dict__.pop("distribution", None)
         self._mean = mean_actions
         self._std = th.ones_like(mean_actions) * log_std.exp()
         return self
 
-    @property
+    @cached_property
     def distribution(self) -> Normal:  # type: ignore[override]
         """Torch's, as SB3 has it, made when it is asked for."""
         return Normal(self._mean, self._std)
@@ -242,7 +239,7 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :return: Actions, ``(batch_size, action_dim)``, through which gradients flow
         """
         noise = th.empty(self._mean.shape, dtype=self._mean.dtype, device=self._mean.device).normal_()
-        return _without_nan(self._mean) + noise * self._std
+        return _without_nan(self._mean + noise * self._std)
 
     def mode(self) -> th.Tensor:
         """
@@ -264,8 +261,8 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     """
     Give a model lean action distributions. What it does, learns and saves stays the same, to the bit; it takes less time.
 
-    Nothing changes for a policy that makes its distribution in its own way, and where the distribution is none of SB3's
-    categorical, multi-categorical, Bernoulli and diagonal Gaussian ones (gSDE, the maskable ones of sb3-contrib).
+    Nothing changes for a policy with a method of its own that makes or uses its distribution, and for distributions other than
+    SB3's categorical, multi-categorical, Bernoulli and diagonal Gaussian ones (gSDE, the maskable ones of sb3-contrib).
 
     An action is never drawn from NaN, as with torch's distributions. Where it came from is said by a
     :class:`~sb3_cchain.FiniteCheck` among the callbacks, which looks at the policy once per rollout.
@@ -276,7 +273,14 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     policy = uncompiled(model.policy)
     # The very class: a subclass may do something else
     make = _LEAN.get(type(policy.action_dist))
-    makes_its_own = type(policy)._get_action_dist_from_latent is not ActorCriticPolicy._get_action_dist_from_latent
-    if make is not None and not makes_its_own:
+    if make is not None and all(_is_sb3s(getattr(policy, name)) for name in _METHODS):
         policy.action_dist = make(policy.action_dist)
     return model
+
+
+# Of a policy, those that make its distribution or use it
+_METHODS = ("_get_action_dist_from_latent", "get_distribution", "forward", "evaluate_actions")
+
+
+def _is_sb3s(method: Callable[..., Any]) -> bool:
+    return method.__module__.startswith(("stable_baselines3.", "sb3_contrib."))

@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_cchain.networks.policy_networks import PlainNetworks, is_plain
+from sb3_cchain.networks.policy_networks import PlainNetworks, hooks_of, is_plain
 from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution
 from sb3_cchain.replaced import replaced
 
@@ -53,7 +53,7 @@ class LeanForward:
         assert policy.action_space.shape is not None
         self._action_shape = policy.action_space.shape
         # They may be registered in the middle of a rollout
-        self._hooks = [hooks for module in policy.modules() for hooks in (module._forward_pre_hooks, module._forward_hooks)]
+        self._hooks = hooks_of(policy)
 
     def __call__(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """

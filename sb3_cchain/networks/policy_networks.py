@@ -1,6 +1,6 @@
 """The networks of an SB3 actor-critic policy, as functions of observations."""
 
-from collections.abc import Callable
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -9,6 +9,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+
+KINDS_OF_HOOKS = ("_forward_pre_hooks", "_forward_hooks", "_backward_pre_hooks", "_backward_hooks")
 
 
 class PolicyNetworks:
@@ -63,12 +65,6 @@ class PlainNetworks(PolicyNetworks):
     :param policy: A policy, of which ``is_plain()`` is true
     """
 
-    def __init__(self, policy: ActorCriticPolicy):
-        super().__init__(policy)
-        self._actor = _layers(policy.mlp_extractor.policy_net)
-        self._critic = [*_layers(policy.mlp_extractor.value_net), policy.value_net.forward]
-        self.outputs = policy.action_net.forward  # type: ignore[method-assign]
-
     def actor_features(self, observations: PyTorchObs) -> th.Tensor:
         """As of the base class."""
         assert th.is_tensor(observations)
@@ -78,20 +74,27 @@ class PlainNetworks(PolicyNetworks):
 
     def latent(self, features: th.Tensor) -> th.Tensor:
         """As of the base class."""
-        for layer in self._actor:
-            features = layer(features)
+        for layer in self.policy.mlp_extractor.policy_net:
+            features = layer.forward(features)
         return features
+
+    def outputs(self, latent: th.Tensor) -> th.Tensor:
+        """As of the base class."""
+        return self.policy.action_net.forward(latent)
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """As of the base class."""
-        for layer in self._critic:
-            features = layer(features)
-        return features
+        for layer in self.policy.mlp_extractor.value_net:
+            features = layer.forward(features)
+        return self.policy.value_net.forward(features)
 
 
-def _layers(network: nn.Module) -> list[Callable[[th.Tensor], th.Tensor]]:
-    assert isinstance(network, nn.Sequential)
-    return [layer.forward for layer in network]
+def hooks_of(policy: nn.Module) -> list[dict[int, Any]]:
+    """
+    :param policy: A policy
+    :return: Of each of its modules and each kind of hooks, where PyTorch keeps them
+    """
+    return [getattr(module, kind) for module in policy.modules() for kind in KINDS_OF_HOOKS]
 
 
 def is_plain(policy: nn.Module) -> bool:
@@ -106,13 +109,14 @@ def is_plain(policy: nn.Module) -> bool:
         and not is_image_space(policy.observation_space)
         and type(policy.features_extractor) is FlattenExtractor
         and type(policy.mlp_extractor) is MlpExtractor
-        and not any(module._forward_pre_hooks or module._forward_hooks for module in policy.modules())
+        and type(policy.mlp_extractor.policy_net) is type(policy.mlp_extractor.value_net) is nn.Sequential
+        and not any(hooks_of(policy))
     )
 
 
 def networks_of(policy: ActorCriticPolicy) -> PolicyNetworks:
     """
     :param policy: An actor-critic policy that extracts features as SB3's do
-    :return: Its networks, as long as its layers are not replaced and get no hooks
+    :return: Its networks, for as long as no module is put in place and no hook is registered
     """
     return PlainNetworks(policy) if is_plain(policy) else PolicyNetworks(policy)

@@ -51,8 +51,17 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
     if has_own_distribution(type(uncompiled(policy))):
         return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
-    networks = PolicyNetworks(policy)
-    return of_action_net(policy, networks.outputs(networks.latent(networks.actor_features(observations))))
+    return actor_outputs(PolicyNetworks(policy), observations)
+
+
+def actor_outputs(networks: PolicyNetworks, observations: PyTorchObs) -> th.Tensor:
+    """
+    :param networks: Those of a policy that makes its distribution as SB3's do
+    :param observations: Batch of observations
+    :return: As of :func:`policy_outputs`, without making the distribution
+    """
+    outputs = networks.outputs(networks.latent(networks.actor_features(observations)))
+    return of_action_net(networks.policy, outputs)
 
 
 def of_action_net(policy: ActorCriticPolicy, outputs: th.Tensor) -> th.Tensor:
