@@ -59,7 +59,12 @@ class _Categorical:
         return -(finite * self.probs).sum(-1)
 
     def sample(self) -> th.Tensor:
-        return th.multinomial(_without_nan(self.probs), 1, replacement=True).squeeze(-1)
+        # On the CPU multinomial() itself looks for NaN; on a GPU it would end the process
+        probs = self.probs if self.probs.device.type == "cpu" else _without_nan(self.probs)
+        try:
+            return th.multinomial(probs, 1, replacement=True).squeeze(-1)
+        except RuntimeError as error:
+            raise ValueError(NAN_OUTPUTS) from error
 
     def mode(self) -> th.Tensor:
         return _without_nan(self.probs).argmax(dim=1)

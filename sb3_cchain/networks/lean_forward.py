@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_cchain.networks.policy_networks import PlainNetworks, hooks_of, is_plain
+from sb3_cchain.networks.policy_networks import FORWARD_HOOKS, PlainNetworks, hooks_of, is_plain
 from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution
 from sb3_cchain.replaced import replaced
 
@@ -52,8 +52,8 @@ class LeanForward:
         self._networks = PlainNetworks(policy)
         assert policy.action_space.shape is not None
         self._action_shape = policy.action_space.shape
-        # They may be registered in the middle of a rollout
-        self._hooks = hooks_of(policy)
+        # They may be registered in the middle of a rollout. There is no backward pass in it
+        self._hooks = hooks_of(policy, FORWARD_HOOKS)
 
     def __call__(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """

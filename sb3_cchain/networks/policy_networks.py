@@ -1,5 +1,6 @@
 """The networks of an SB3 actor-critic policy, as functions of observations."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -10,7 +11,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-KINDS_OF_HOOKS = ("_forward_pre_hooks", "_forward_hooks", "_backward_pre_hooks", "_backward_hooks")
+FORWARD_HOOKS = ("_forward_pre_hooks", "_forward_hooks")
+BACKWARD_HOOKS = ("_backward_pre_hooks", "_backward_hooks")
 
 
 class PolicyNetworks:
@@ -89,12 +91,13 @@ class PlainNetworks(PolicyNetworks):
         return self.policy.value_net.forward(features)
 
 
-def hooks_of(policy: nn.Module) -> list[dict[int, Any]]:
+def hooks_of(policy: nn.Module, kinds: Sequence[str] = (*FORWARD_HOOKS, *BACKWARD_HOOKS)) -> list[dict[int, Any]]:
     """
     :param policy: A policy
-    :return: Of each of its modules and each kind of hooks, where PyTorch keeps them
+    :param kinds: Kinds of hooks
+    :return: Where PyTorch keeps the hooks of each of its modules
     """
-    return [getattr(module, kind) for module in policy.modules() for kind in KINDS_OF_HOOKS]
+    return [getattr(module, kind) for module in policy.modules() for kind in kinds]
 
 
 def is_plain(policy: nn.Module) -> bool:
