@@ -367,8 +367,8 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
 def test_rates_by_hand(tmp_path):
     acrobot = replace(RUN, env_id="Continual/Acrobot-v1", experiment="reduced")
     paper = replace(RUN, experiment="paper", n_tasks=1, steps_per_task=1000)
-    # Nothing known: 520 steps per second, 500 of Vanilla
-    assert Rates([]).seconds(paper) == pytest.approx(1000 / 520)
+    # Nothing known: 510 steps per second, 500 of Vanilla
+    assert Rates([]).seconds(paper) == pytest.approx(1000 / 510)
     assert Rates([]).seconds(replace(paper, method="weight_clipping")) == pytest.approx(2.0)
     results = [make_result(tmp_path, RUN, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
     results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
@@ -388,7 +388,7 @@ def test_durations():
 def test_time_left_by_hand(monkeypatch):
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    some = [replace(RUN, seed=seed, steps_per_task=5200) for seed in range(5)]  # 20 seconds each at 520 steps per second
+    some = [replace(RUN, seed=seed, steps_per_task=5100) for seed in range(5)]  # 20 seconds each at 510 steps per second
     console = Console(record=True, width=200)
     view = View(some, n_done=3, rates=Rates([]), console=console)
     view.slots = 2
