@@ -55,13 +55,25 @@ class NotSaved(ValueError):
     """An attribute that a state needs cannot be saved."""
 
 
+class Data(NamedTuple):
+    """
+    A value that is copied as a whole.
+
+    :param number: By which :class:`Same` refers to it
+    :param content: Pickled
+    """
+
+    number: int
+    content: bytes
+
+
 class Attributes(NamedTuple):
     """
     State of an object by its attributes.
 
     :param number: By which :class:`Same` refers to it
     :param kind: Name of its class
-    :param values: By name: pickled data, or the state of another object
+    :param values: State of each attribute
     """
 
     number: int
@@ -69,79 +81,116 @@ class Attributes(NamedTuple):
     values: dict[str, Any]
 
 
+class StateDict(NamedTuple):
+    """
+    What ``state_dict()`` of an object returned.
+
+    :param number: By which :class:`Same` refers to the object
+    :param content: Pickled
+    """
+
+    number: int
+    content: bytes
+
+
 class Same(NamedTuple):
     """
-    The object whose state stands elsewhere in the same state.
+    A value whose state stands elsewhere in the same state.
 
-    :param number: Number of the other object
+    :param number: Its number
     """
 
     number: int
 
 
-class StateDict(NamedTuple):
-    """
-    What ``state_dict()`` returned.
-
-    :param content: Pickled
-    """
-
-    content: bytes
-
-
-class Elsewhere(NamedTuple):
+class Known(NamedTuple):
     """
     An object whose state is kept elsewhere.
 
-    :param name: Its name among the known objects
+    :param name: Its name
     """
 
     name: str
 
 
-def object_state(
-    holder: object,
+def object_states(
+    holders: Mapping[str, object],
     known: Mapping[str, object] | None = None,
     *,
     skip: Collection[str] = (),
     strict: bool = False,
     left_out: list[str] | None = None,
-) -> Attributes:
+) -> dict[str, Any]:
     """
-    :param holder: An object
-    :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the state is put back
-    :param skip: Names of attributes of the object that are not part of its state
-    :param strict: Whether all that the object refers to is part of its state. Otherwise plain data and tensors are, and objects
-        whose class comes from a package that a class of the object comes from, such as Stable-Baselines3 for a callback
-    :param left_out: Takes the names of what is not part of the state without ``strict``, as ``attribute.attribute``
-    :return: Its state, which can be pickled and does not change any more
+    :param holders: Objects by names. What several of them refer to is still one object when their states are put back
+    :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the states are put back
+    :param skip: Names of attributes of the holders that are not part of their state
+    :param strict: Whether all that a holder refers to is part of its state. Otherwise plain data and tensors are, and objects
+        whose class comes from a package that a class of the holder comes from, such as Stable-Baselines3 for a callback
+    :param left_out: Takes the names of what is not part of the state without ``strict``, as ``holder.attribute.attribute``
+    :return: The state of each, which can be pickled and does not change any more
     :raises NotSaved: With ``strict``, for an attribute that cannot be saved
     """
-    return _Reader(known or {}, strict, [] if left_out is None else left_out).attributes(holder, "", skip)
+    reader = _Reader({**(known or {}), **holders}, strict, [] if left_out is None else left_out)
+    return {name: reader.holder(holder, name, skip) for name, holder in holders.items()}
 
 
-def restore_object(holder: object, state: Attributes, known: Mapping[str, object] | None = None) -> None:
+def restore_objects(
+    holders: Mapping[str, object], states: Mapping[str, Any], known: Mapping[str, object] | None = None
+) -> None:
     """
-    Put a state back. Attributes that are not part of the state stay as they are.
+    Put states back. Attributes that are not part of a state stay as they are.
 
+    :param holders: Objects of the same classes as those that the states were read from
+    :param states: What :func:`object_states` returned
+    :param known: As given to :func:`object_states`
+    """
+    writer = _Writer({**(known or {}), **holders})
+    for name, state in states.items():
+        writer.fill_holder(holders[name], state)
+
+
+def object_state(
+    holder: object, known: Mapping[str, object] | None = None, *, skip: Collection[str] = (), strict: bool = False
+) -> Any:
+    """
+    :func:`object_states` of a single object.
+
+    :param holder: An object
+    :param known: See :func:`object_states`
+    :param skip: See :func:`object_states`
+    :param strict: See :func:`object_states`
+    :return: Its state
+    """
+    return object_states({"": holder}, known, skip=skip, strict=strict)[""]
+
+
+def restore_object(holder: object, state: Any, known: Mapping[str, object] | None = None) -> None:
+    """
     :param holder: An object of the same class as the one that the state was read from
     :param state: What :func:`object_state` returned
     :param known: As given to :func:`object_state`
     """
-    _Writer(known or {}).fill(holder, state)
+    restore_objects({"": holder}, {"": state}, known)
 
 
 class _Reader:
     def __init__(self, known: Mapping[str, object], strict: bool, left_out: list[str]):
         self._known = {id(value): name for name, value in known.items()}
         self._strict, self._left_out = strict, left_out
+        # Numbers of the values that have been met, by id; and these values, so that no other gets the id of one of them
         self._numbers: dict[int, int] = {}
+        self._met: list[object] = []
         self._packages: set[str] = set()
 
-    def attributes(self, holder: object, path: str, skip: Collection[str] = ()) -> Attributes:
-        if not path:
-            self._packages = {_package(kind) for kind in type(holder).__mro__} - {"builtins"}
-        number = self._numbers[id(holder)] = len(self._numbers)
+    def holder(self, holder: object, name: str, skip: Collection[str]) -> Any:
+        self._packages = {_package(kind) for kind in type(holder).__mro__} - {"builtins"}
+        if _has_state_dict(holder):
+            return StateDict(self._number(holder), self._pickled(holder.state_dict()))
+        return self._attributes(holder, name, skip)
+
+    def _attributes(self, holder: object, path: str, skip: Collection[str] = ()) -> Attributes:
+        number = self._number(holder)
         values = {}
         for name, value in vars(holder).items():
             if name in skip or (isinstance(holder, spaces.Space) and name not in SPACE_STATE):
@@ -155,17 +204,18 @@ class _Reader:
         if isinstance(value, KEPT):
             return None
         if id(value) in self._known:
-            return Elsewhere(self._known[id(value)])
+            return Known(self._known[id(value)])
         if id(value) in self._numbers:
             return Same(self._numbers[id(value)])
         if _has_state_dict(value):
-            return StateDict(self._pickled(value.state_dict()))
+            return StateDict(self._number(value), self._pickled(value.state_dict()))
         if self._is_entered(value):
-            return self.attributes(value, path)
+            return self._attributes(value, path)
         try:
             if not self._strict and not _is_data(value):
-                raise NotSaved("it is an object of another package")
-            return self._pickled(value)
+                raise NotSaved("an object of another package")
+            content = self._pickled(value)
+            return Data(self._number(value), content)
         except Exception as error:  # whatever the object's own code raises
             if self._strict:
                 raise NotSaved(f"{path}: {error}") from error
@@ -177,19 +227,25 @@ class _Reader:
             return True
         return not _is_data(value) and (self._strict or _package(type(value)) in self._packages)
 
+    def _number(self, value: Any) -> int:
+        self._met.append(value)
+        return self._numbers.setdefault(id(value), len(self._numbers))
+
     def _pickled(self, value: Any) -> bytes:
         file = io.BytesIO()
-        _Pickler(file, self._known).dump(value)
+        KnownPickler(file, self._known).dump(value)
         return file.getvalue()
 
 
 class _Writer:
     def __init__(self, known: Mapping[str, object]):
         self._known = known
-        self._objects: dict[int, object] = {}
+        self._values: dict[int, Any] = {}
 
-    def fill(self, holder: object, state: Attributes) -> None:
-        self._objects[state.number] = holder
+    def fill_holder(self, holder: object, state: Any) -> None:
+        self._value(holder, state)
+
+    def _fill(self, holder: object, state: Attributes) -> None:
         for name, value in state.values.items():
             old = vars(holder).get(name)
             new = self._value(old, value)
@@ -197,53 +253,75 @@ class _Writer:
                 vars(holder)[name] = new
 
     def _value(self, old: Any, state: Any) -> Any:
-        if isinstance(state, Elsewhere):
+        if isinstance(state, Known):
             return self._known[state.name]
         if isinstance(state, Same):
-            return self._objects[state.number]
-        if isinstance(state, StateDict):
-            old.load_state_dict(self._unpickled(state.content))
-            return old
+            return self._values[state.number]
         if isinstance(state, Attributes):
             if _class_name(type(old)) != state.kind:
                 kind = _find_class(state.kind)
                 old = kind.__new__(kind)
-            self.fill(old, state)
+            self._values[state.number] = old
+            self._fill(old, state)
             return old
-        new = self._unpickled(state)
+        if isinstance(state, StateDict):
+            self._values[state.number] = old
+            old.load_state_dict(self._unpickled(state.content))
+            return old
+        new = self._unpickled(state.content)
         if type(old) is type(new) and type(new) in _COPY_INTO:
             _COPY_INTO[type(new)](old, new)
-            return old
+            new = old
+        self._values[state.number] = new
         return new
 
     def _unpickled(self, content: bytes) -> Any:
-        return _Unpickler(io.BytesIO(content), self._known).load()
+        return KnownUnpickler(io.BytesIO(content), self._known).load()
 
 
-class _Pickler(pickle.Pickler):
-    """Refers to known objects by their names, and saves of a tensor no more than the tensor."""
+class KnownPickler(pickle.Pickler):
+    """
+    Refers to known objects by their names, and saves of a tensor no more than the tensor.
 
-    def __init__(self, file: io.BytesIO, known: Mapping[int, str]):
-        super().__init__(file, protocol=5)
+    :param file: Where it writes
+    :param known: Names of the known objects, by their ids
+    :param kwargs: Arguments of ``pickle.Pickler``
+    """
+
+    def __init__(self, file: Any, known: Mapping[int, str], **kwargs: Any):
+        super().__init__(file, protocol=5, **kwargs)
         self._known = known
 
     def persistent_id(self, value: Any) -> str | None:
+        """See ``pickle.Pickler``."""
         return self._known.get(id(value))
 
     def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, th.Tensor) and not value.is_leaf:
+        """See ``pickle.Pickler``."""
+        if not isinstance(value, th.Tensor):
+            return NotImplemented
+        if not value.is_leaf:
             value = value.detach()
-        if isinstance(value, th.Tensor) and value.untyped_storage().nbytes() > value.nbytes:
+        if value.untyped_storage().nbytes() > value.nbytes:
             value = value.clone()
-        return value.__reduce_ex__(5) if isinstance(value, th.Tensor) else NotImplemented
+        return value.__reduce_ex__(5)
 
 
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, known: Mapping[str, object]):
-        super().__init__(file)
+class KnownUnpickler(pickle.Unpickler):
+    """
+    Reads what :class:`KnownPickler` wrote.
+
+    :param file: Where it reads
+    :param known: The known objects by their names
+    :param kwargs: Arguments of ``pickle.Unpickler``
+    """
+
+    def __init__(self, file: Any, known: Mapping[str, object], **kwargs: Any):
+        super().__init__(file, **kwargs)
         self._known = known
 
     def persistent_load(self, name: str) -> object:
+        """See ``pickle.Unpickler``."""
         return self._known[name]
 
 
