@@ -49,6 +49,20 @@ class ReturnsFile:
         csv.DictWriter(self._file, COLUMNS).writerows(rows)
         self._file.flush()
 
+    def state_dict(self) -> dict[str, str]:
+        """
+        :return: What the file holds
+        """
+        return {"text": Path(self._file.name).read_text()}
+
+    def load_state_dict(self, state: dict[str, str]) -> None:
+        """
+        :param state: What :meth:`state_dict` returned
+        """
+        self._file.truncate(0)
+        self._file.write(state["text"])
+        self._file.flush()
+
     def close(self) -> None:
         """Close the file, which another process can write then."""
         self._file.close()

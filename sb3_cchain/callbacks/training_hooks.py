@@ -37,6 +37,17 @@ class TrainingHooks:
         """Remove all hooks."""
         self._attached.close()
 
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Nothing: training that is resumed in another process attaches hooks of its own
+        """
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: What :meth:`state_dict` returned
+        """
+
     def before_step(self, optimizer: th.optim.Optimizer, function: Callable[[th.optim.Optimizer], None]) -> None:
         """
         :param optimizer: An optimiser of the model

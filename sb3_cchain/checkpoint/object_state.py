@@ -25,10 +25,10 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import ResultsWriter
 
-# They belong to the process: code, files, and how something was made
-KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, property, io.IOBase, EnvSpec, ResultsWriter)
+# They belong to the process: code, files and their places, and how something was made
+KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, property, io.IOBase, PurePath, EnvSpec, ResultsWriter)
 # They are copied as a whole
-DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum, PurePath)
+DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
 
 # What changes in a space: the random numbers of its samples
 SPACE_STATE = ("_np_random", "spaces")
@@ -117,22 +117,22 @@ def object_states(
     holders: Mapping[str, object],
     known: Mapping[str, object] | None = None,
     *,
-    skip: Collection[str] = (),
+    skip: Mapping[str, Collection[str]] | None = None,
     strict: bool = False,
     left_out: list[str] | None = None,
 ) -> dict[str, Any]:
     """
     :param holders: Objects by names. What several of them refer to is still one object when their states are put back
     :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the states are put back
-    :param skip: Names of attributes of the holders that are not part of their state
+    :param skip: For each holder the names of its attributes that are not part of its state
     :param strict: Whether all that a holder refers to is part of its state. Otherwise plain data and tensors are, and objects
-        whose class comes from a package that a class of the holder comes from, such as Stable-Baselines3 for a callback
+        whose class comes from this package, or from one that a class of the holder comes from
     :param left_out: Takes the names of what is not part of the state without ``strict``, as ``holder.attribute.attribute``
     :return: The state of each, which can be pickled and does not change any more
     :raises NotSaved: With ``strict``, for an attribute that cannot be saved
     """
     reader = _Reader({**(known or {}), **holders}, strict, [] if left_out is None else left_out)
-    return {name: reader.holder(holder, name, skip) for name, holder in holders.items()}
+    return {name: reader.holder(holder, name, (skip or {}).get(name, ())) for name, holder in holders.items()}
 
 
 def restore_objects(
@@ -158,11 +158,11 @@ def object_state(
 
     :param holder: An object
     :param known: See :func:`object_states`
-    :param skip: See :func:`object_states`
+    :param skip: Names of its attributes that are not part of its state
     :param strict: See :func:`object_states`
     :return: Its state
     """
-    return object_states({"": holder}, known, skip=skip, strict=strict)[""]
+    return object_states({"": holder}, known, skip={"": skip}, strict=strict)[""]
 
 
 def restore_object(holder: object, state: Any, known: Mapping[str, object] | None = None) -> None:
@@ -184,7 +184,7 @@ class _Reader:
         self._packages: set[str] = set()
 
     def holder(self, holder: object, name: str, skip: Collection[str]) -> Any:
-        self._packages = {_package(kind) for kind in type(holder).__mro__} - {"builtins"}
+        self._packages = {"sb3_cchain", *map(_package, type(holder).__mro__)} - {"builtins"}
         if _has_state_dict(holder):
             return StateDict(self._number(holder), self._pickled(holder.state_dict()))
         return self._attributes(holder, name, skip)
@@ -266,7 +266,8 @@ class _Writer:
             return old
         if isinstance(state, StateDict):
             self._values[state.number] = old
-            old.load_state_dict(self._unpickled(state.content))
+            if _has_state_dict(old):  # not None, as the file of a training that writes none
+                old.load_state_dict(self._unpickled(state.content))
             return old
         new = self._unpickled(state.content)
         if type(old) is type(new) and type(new) in _COPY_INTO:

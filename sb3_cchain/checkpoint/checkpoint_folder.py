@@ -1,0 +1,289 @@
+"""
+Checkpoints of a training on the disk.
+
+A folder of checkpoints holds ``step_000010000``, ``step_000020000`` and so on, each of which is whole or absent, and ``chunks``,
+the pieces of their big arrays. Only one training writes to it at a time.
+"""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import warnings
+from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from platform import python_version
+from typing import Any, TextIO
+from weakref import WeakValueDictionary
+
+from sb3_cchain.checkpoint.chunks import ChunkStore
+from sb3_cchain.checkpoint.files import sync_folder, write_safely
+
+try:
+    import fcntl
+except ImportError:  # Windows: a second training in the same folder is not noticed
+    fcntl = None  # type: ignore[assignment]
+
+# Of the files. A later version of the package reads it, or says that it does not
+FORMAT = 1
+INFO, MODEL, STATE = "checkpoint.json", "model.zip", "training.pkl"
+PACKAGES = ("sb3-cchain", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy")
+
+
+class Checkpoint:
+    """
+    A checkpoint on the disk, which is whole.
+
+    :param path: Its folder
+    :raises ValueError: When it is no checkpoint, torn, damaged, or of a format that this version does not read
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self.info: dict[str, Any] = _read_info(self.path)
+        for name, expected in self.info["files"].items():
+            file = self.path / name
+            if not file.is_file() or _hash(file) != expected:
+                raise ValueError(f"{self.path} is damaged: {name} is missing, or is not what was written")
+        if not self.store.has(self.info["chunks"]):
+            raise ValueError(f"{self.path} is damaged: pieces of its arrays are missing in {self.store.folder}")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of checkpoints that it is in."""
+        return self.path.parent
+
+    @property
+    def store(self) -> ChunkStore:
+        """The pieces of the big arrays."""
+        return chunk_store(self.folder)
+
+    @property
+    def model_path(self) -> Path:
+        """The model, as Stable-Baselines3 saves it."""
+        return self.path / MODEL
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps that the model was trained for."""
+        return self.info["num_timesteps"]
+
+    @property
+    def total_timesteps(self) -> int:
+        """Environment steps at which the training was to end."""
+        return self.info["total_timesteps"]
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that the training had taken, interruptions not counted."""
+        return self.info["seconds"]
+
+    def read_state(self) -> dict[str, Any]:
+        """
+        :return: What is not in the model's file. Unpickled, so a checkpoint must come from somebody you trust.
+        """
+        with open(self.path / STATE, "rb") as file:
+            state: dict[str, Any] = pickle.load(file)
+        return state
+
+    def warn_of_other_versions(self) -> None:
+        """Warn when it was made by other versions than those that are installed: results may differ then."""
+        installed = package_versions()
+        other = [
+            f"{name} {made_with} (now {installed.get(name, 'absent')})"
+            for name, made_with in self.info["versions"].items()
+            if installed.get(name) != made_with
+        ]
+        if other:
+            warnings.warn(
+                f"{self.path} was made with {', '.join(other)}. Training goes on, but perhaps not exactly as it would have."
+            )
+
+
+def find_checkpoint(path: str | Path) -> Checkpoint:
+    """
+    :param path: A checkpoint, or a folder of checkpoints
+    :return: The checkpoint, or the newest whole one in the folder
+    :raises ValueError: When there is none, or the one given is damaged
+    """
+    path = Path(path)
+    candidates = _step_folders(path)
+    if not candidates:
+        try:
+            return Checkpoint(path)
+        except ValueError as error:
+            whole = next(filter(None, map(_whole, _step_folders(path.parent))), None)
+            advice = "" if whole is None else f". The newest whole checkpoint beside it is {whole.path}"
+            raise ValueError(f"{error}{advice}") from None
+    for candidate in candidates:
+        try:
+            return Checkpoint(candidate)
+        except ValueError as error:
+            warnings.warn(f"{error}. An older checkpoint is taken instead.")
+    raise ValueError(f"{path} holds no whole checkpoint")
+
+
+def _whole(path: Path) -> Checkpoint | None:
+    try:
+        return Checkpoint(path)
+    except ValueError:
+        return None
+
+
+def _step_folders(folder: Path) -> list[Path]:
+    """The checkpoints in a folder, the newest first."""
+    return sorted(folder.glob("step_*"), reverse=True)
+
+
+def chunk_store(folder: Path) -> ChunkStore:
+    """
+    :param folder: A folder of checkpoints
+    :return: The pieces of their big arrays
+    """
+    return ChunkStore(folder / "chunks")
+
+
+class CheckpointFolder:
+    """
+    A folder of checkpoints to write to, locked against other trainings until it is closed.
+
+    :param path: The folder; it is made if it does not exist
+    :param keep: How many checkpoints stay
+    :param newest: Step of the newest checkpoint that may be there; None when there must be none
+    :raises ValueError: When another training writes to it, or there are later checkpoints in it
+    """
+
+    def __init__(self, path: Path, keep: int, newest: int | None = None):
+        self.path, self.keep = path, keep
+        path.mkdir(parents=True, exist_ok=True)
+        self._lock: TextIO = _locked(path)
+        try:
+            self._check_newest(newest)
+        except ValueError:
+            self.close()
+            raise
+        for unfinished in path.glob(".step_*"):
+            shutil.rmtree(unfinished)
+
+    def _check_newest(self, newest: int | None) -> None:
+        there = _step_folders(self.path)
+        if newest is None and there:
+            raise ValueError(
+                f"`path` holds checkpoints of another training already, the newest of which is {there[0]}. Go on from it by "
+                "resume(), give another path, or move them away."
+            )
+        later = [folder for folder in there if newest is not None and folder.name > step_name(newest)]
+        if later:
+            raise ValueError(
+                f"Training goes on from step {newest}, but `path` holds later checkpoints, the newest of which is {later[0]}. "
+                "Give another path, or move them away."
+            )
+
+    @property
+    def store(self) -> ChunkStore:
+        """The pieces of the big arrays."""
+        return chunk_store(self.path)
+
+    def write(self, info: Mapping[str, Any], save_model: Callable[[Path], None], state: Mapping[str, Any]) -> Path:
+        """
+        Write a checkpoint, and remove those that are too many.
+
+        :param info: What is known about it
+        :param save_model: Writes the model's file
+        :param state: What is not in the model's file
+        :return: Its folder
+        """
+        target = self.path / step_name(info["num_timesteps"])
+        if target.exists():  # stopped before anything was trained
+            return target
+        unfinished = self.path / f".{target.name}"
+        unfinished.mkdir()
+        with write_safely(unfinished / MODEL) as path:
+            save_model(path)
+        with write_safely(unfinished / STATE) as path, open(path, "wb") as file:
+            pickle.dump(state, file, protocol=5)
+        files = {name: _hash(unfinished / name) for name in (MODEL, STATE)}
+        with write_safely(unfinished / INFO) as path:
+            path.write_text(json.dumps({"format": FORMAT, **info, "files": files}, indent=1) + "\n")
+        os.rename(unfinished, target)
+        sync_folder(self.path)
+        self._remove_old()
+        return target
+
+    def _remove_old(self) -> None:
+        folders = _step_folders(self.path)
+        for folder in folders[self.keep :]:
+            # By a hidden name first, so that one that is half removed does not pass for a damaged one
+            hidden = folder.with_name(f".{folder.name}")
+            os.rename(folder, hidden)
+            shutil.rmtree(hidden)
+        self.store.remove_all_but({name for folder in folders[: self.keep] for name in _read_info(folder)["chunks"]})
+
+    def close(self) -> None:
+        """Let others write to it."""
+        self._lock.close()
+
+
+def step_name(num_timesteps: int) -> str:
+    """
+    :param num_timesteps: Environment steps
+    :return: Name of the checkpoint's folder
+    """
+    return f"step_{num_timesteps:012d}"
+
+
+def package_versions() -> dict[str, str]:
+    """
+    :return: The versions that a checkpoint names
+    """
+    found = {"python": python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _read_info(path: Path) -> dict[str, Any]:
+    file = path / INFO
+    if not file.is_file():
+        raise ValueError(f"{path} is not a checkpoint of a training: it has no {INFO}")
+    try:
+        info: dict[str, Any] = json.loads(file.read_text())
+        found = info["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    if found != FORMAT:
+        made_with = info.get("versions", {}).get("sb3-cchain", "an unknown version")
+        raise ValueError(f"{path} has the format {found} of sb3-cchain {made_with}; this version reads the format {FORMAT}")
+    return info
+
+
+def _hash(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+# The locks of this process. One that is still held belongs to training that was interrupted
+_locks: WeakValueDictionary[Path, TextIO] = WeakValueDictionary()
+
+
+def _locked(folder: Path) -> TextIO:
+    interrupted = _locks.pop(folder.resolve(), None)
+    if interrupted is not None:
+        interrupted.close()
+    file = open(folder / ".lock", "w")
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise ValueError(
+                f"Another process is writing checkpoints to {folder}. Give each training a `path` of its own."
+            ) from None
+        except OSError:
+            pass  # the file system has no locks
+    _locks[folder.resolve()] = file
+    return file

@@ -1,0 +1,92 @@
+"""Going on with training that was saved by a TrainingCheckpoint."""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
+
+
+def resume(
+    path: str | Path,
+    env: GymEnv,
+    callback: MaybeCallback = None,
+    *,
+    total_timesteps: int | None = None,
+    logger: Logger | None = None,
+    device: th.device | str = "auto",
+) -> BaseAlgorithm:
+    """
+    Go on with training that a :class:`~sb3_cchain.TrainingCheckpoint` saved, up to the number of steps that it was to have.
+    On the CPU it is the same as if it had not been interrupted, to the bit.
+
+    The model, its class and its hyperparameters come from the checkpoint. The environment and the callbacks are made as before
+    the interruption; their state comes from the checkpoint. Further checkpoints go to the same folder.
+
+    :param path: A checkpoint, or the folder of checkpoints, whose newest whole one is taken
+    :param env: The environment, made as before
+    :param callback: The callbacks that were given to ``learn()``, made as before and in the same order. The former
+        TrainingCheckpoint may be left out where it was the last
+    :param total_timesteps: Environment steps at which training ends, those before the interruption included; by default as before
+    :param logger: The logger; by default the model logs as it did, to the same folder for TensorBoard
+    :param device: PyTorch device
+    :return: The trained model
+    :raises ValueError: When there is no whole checkpoint, when the training was at its end already, or naming what differs
+        from the training that was saved
+    """
+    checkpoint = find_checkpoint(path)
+    remaining = (checkpoint.total_timesteps if total_timesteps is None else total_timesteps) - checkpoint.num_timesteps
+    if remaining <= 0:
+        raise ValueError(
+            f"`total_timesteps` must be more than the {checkpoint.num_timesteps} steps that the model in {checkpoint.path} was "
+            f"trained for; got {total_timesteps or checkpoint.total_timesteps}"
+        )
+    model = load_model(checkpoint, env, device)
+    if logger is None and model.tensorboard_log is not None and checkpoint.info["log_folder"] is not None:
+        logger = configure(checkpoint.info["log_folder"], ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
+    if logger is not None:
+        model.set_logger(logger)
+    callbacks = with_checkpoint(_as_list(callback), checkpoint)
+    model.learn(remaining, callbacks, reset_num_timesteps=False, **checkpoint.info["learn"])  # type: ignore[arg-type]
+    return model
+
+
+def load_model(checkpoint: Checkpoint, env: GymEnv, device: th.device | str = "auto") -> BaseAlgorithm:
+    """
+    :param checkpoint: A checkpoint
+    :param env: The environment to go on in
+    :param device: PyTorch device
+    :return: The model, as Stable-Baselines3 loads it
+    """
+    module, name = checkpoint.info["algorithm"].split(":")
+    algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
+    return algorithm.load(checkpoint.model_path, env, device)
+
+
+def with_checkpoint(given: list[BaseCallback], checkpoint: Checkpoint) -> list[BaseCallback]:
+    """
+    :param given: Callbacks of ``learn()``
+    :param checkpoint: The checkpoint to go on from
+    :return: The same, with a TrainingCheckpoint that goes on from it: the one among them, or a new one at their end
+    """
+    for found in iterate_callbacks(CallbackList(given)):
+        if isinstance(found, TrainingCheckpoint):
+            found.go_on_from(checkpoint)
+            return given
+    return [*given, TrainingCheckpoint.resume_from(checkpoint)]
+
+
+def _as_list(callback: MaybeCallback) -> list[BaseCallback]:
+    if callback is None:
+        return []
+    if isinstance(callback, list):
+        return callback
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]

@@ -1,0 +1,229 @@
+"""A callback that saves the whole training at intervals and when it is told to stop, and another learn() that goes on exactly."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, package_versions
+from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
+from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
+from sb3_cchain.checkpoint.training_state import TrainingParts, chunk_names, restore_training, training_parts, training_state
+from sb3_cchain.tasks.callback_tree import require_single
+from sb3_cchain.validation import check_bool, check_number
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class TrainingCheckpoint(BaseCallback):
+    """
+    Saves all that training depends on, so that :func:`~sb3_cchain.resume` goes on from there as if nothing had happened: to the
+    bit, on the CPU.
+
+    It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were made,
+    and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it ends the
+    training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and learned from
+    before that. A second signal ends the training at once.
+
+    With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in the
+    same rhythm.
+
+    Works with all algorithms of Stable-Baselines3 and sb3-contrib but ARS. The page "Stop and resume" says what is exact.
+
+    :param save_freq: Environment steps from one checkpoint to the next
+    :param path: Folder of the checkpoints. A training has a folder of its own
+    :param keep: How many checkpoints stay
+    :param exact: Whether environments that cannot be resumed in the middle of an episode are refused. Otherwise all environments
+        begin new episodes when training is resumed
+    :raises ValueError: Naming the argument that is out of its range. When training starts: for environments that cannot be
+        resumed exactly, a folder of another training, or a second TrainingCheckpoint
+    """
+
+    def __init__(self, save_freq: int, path: str | Path, keep: int = 2, exact: bool = True):
+        super().__init__()
+        check_number("save_freq", save_freq, 1, integer=True)
+        check_number("keep", keep, 1, integer=True)
+        check_bool("exact", exact)
+        self.save_freq = save_freq
+        self.path = Path(path)
+        self.keep = keep
+        self.exact = exact
+        # How to go on, as it is printed when training was told to stop
+        self.advice = f'Go on from there: sb3_cchain.resume("{path}", env=...)'
+        self._resumed: Checkpoint | None = None
+        self._folder: CheckpointFolder | None = None
+        self._last_saved = 0
+        self._seconds_before = 0.0
+        self._n_rollouts = 0
+        self._stop_signal: int | None = None
+        self._replaced_handlers: dict[int, Any] = {}
+
+    @classmethod
+    def resume_from(
+        cls, checkpoint: Checkpoint, path: str | Path | None = None, save_freq: int | None = None
+    ) -> "TrainingCheckpoint":
+        """
+        :param checkpoint: A checkpoint
+        :param path: Folder of the further checkpoints, by default the one that it is in
+        :param save_freq: Environment steps between them, by default as before
+        :return: A callback with the former settings that goes on from the checkpoint, see :meth:`go_on_from`
+        """
+        settings = checkpoint.info["training_checkpoint"]
+        path = checkpoint.folder if path is None else path
+        callback = cls(save_freq or settings["save_freq"], path, settings["keep"], settings["exact"])
+        callback.go_on_from(checkpoint)
+        return callback
+
+    def go_on_from(self, checkpoint: Checkpoint) -> None:
+        """
+        Put the state back at the start of the first rollout of the next ``learn()``. To be called before ``learn(...,
+        reset_num_timesteps=False)`` of the checkpoint's model, to which this callback is given where the former one was.
+
+        :param checkpoint: A checkpoint
+        """
+        self._resumed = checkpoint
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that the training has taken, interruptions not counted."""
+        return self._seconds_before + time.monotonic() - self._started
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: The time of the last checkpoint
+        """
+        return {"last_saved": self._last_saved, "num_timesteps": self.num_timesteps, "n_calls": self.n_calls}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: What :meth:`state_dict` returned
+        """
+        self._last_saved = state["last_saved"]
+        self.num_timesteps, self.n_calls = state["num_timesteps"], state["n_calls"]
+
+    def _on_training_start(self) -> None:
+        require_single(self)
+        self._release()  # what training that was ended by an error left
+        self._started = time.monotonic()
+        self._n_rollouts, self._stop_signal = 0, None
+        self._parts = training_parts(self.model, self.locals["callback"])
+        self._environment = describe_env(self.training_env)
+        if self._resumed is None:
+            self._last_saved = self.num_timesteps
+        else:
+            self._check_resumed(self._resumed)
+            self._seconds_before = self._resumed.seconds
+        if self.exact:
+            for env in self._parts.envs.values():
+                prepare_environment(env)
+        in_same_folder = self._resumed is not None and self._resumed.folder.resolve() == self.path.resolve()
+        newest = self._resumed.num_timesteps if self._resumed is not None and in_same_folder else None
+        self._folder = CheckpointFolder(self.path, self.keep, newest)
+        self._listen_to_signals()
+
+    def _check_resumed(self, checkpoint: Checkpoint) -> None:
+        checkpoint.warn_of_other_versions()
+        saved = checkpoint.info
+        advice = "Make the training as it was, or load the model as usual, which begins new episodes."
+        check_same(saved["environment"], self._environment, advice)
+        check_same(saved["model"], describe_model(self.model), advice)
+        check_same(saved["callbacks"], describe_callbacks(self._parts.callbacks), "Give the same callbacks in the same order.")
+
+    def _on_rollout_start(self) -> None:
+        if self._resumed is not None:
+            checkpoint, self._resumed = self._resumed, None
+            restore_training(self._parts, checkpoint.read_state(), checkpoint.model_path, checkpoint.store)
+        elif self._stop_signal is not None:
+            self._stop()
+        elif self._is_due():
+            self._save()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._n_rollouts += 1
+
+    def _on_training_end(self) -> None:
+        self._release()
+
+    def _is_due(self) -> bool:
+        if self.num_timesteps - self._last_saved < self.save_freq:
+            return False
+        # The training loop of on-policy algorithms counts its iterations from 0 when training is resumed
+        log_interval = self.locals["log_interval"] if isinstance(self.model, OnPolicyAlgorithm) else None
+        return (not log_interval or self._n_rollouts % log_interval == 0) and self._can_save()
+
+    def _can_save(self) -> bool:
+        return not self.exact or all(map(can_save_environment, self._parts.envs.values()))
+
+    def _save(self) -> Path:
+        assert self._folder is not None
+        self._last_saved = self.num_timesteps
+        state, left_out = training_state(self._parts, self._folder.store, with_envs=self.exact)
+        info = {
+            "versions": package_versions(),
+            "num_timesteps": self.num_timesteps,
+            "total_timesteps": self.model._total_timesteps,
+            "seconds": self.seconds,
+            "algorithm": f"{type(self.model).__module__}:{type(self.model).__qualname__}",
+            "environment": self._environment,
+            "model": describe_model(self.model),
+            "callbacks": describe_callbacks(self._parts.callbacks),
+            "learn": {name: self.locals[name] for name in ("log_interval", "tb_log_name", "progress_bar")},
+            "log_folder": self.logger.dir,
+            "training_checkpoint": {"save_freq": self.save_freq, "keep": self.keep, "exact": self.exact},
+            "left_out": left_out,
+            "chunks": chunk_names(state),
+        }
+        return self._folder.write(info, self.model.save, state)
+
+    def _stop(self) -> None:
+        """End the training, as the signal would have."""
+        saved = self._save() if self._can_save() else None
+        self._release()
+        stopped = f"Training was stopped at step {self.num_timesteps}"
+        if saved is None:
+            print(f"{stopped}, in an episode that cannot be resumed. The last checkpoint is of step {self._last_saved}.")
+        else:
+            print(f"{stopped} and saved to {saved}. {self.advice}", flush=True)
+        if self._stop_signal == signal.SIGTERM:
+            sys.exit(128 + signal.SIGTERM)
+        raise KeyboardInterrupt
+
+    def _listen_to_signals(self) -> None:
+        if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
+            self._replaced_handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._stop_signal is None and _is_learning(self.model, frame):
+            self._stop_signal = number
+            print("Stopping when this rollout has been learned from and saved. Stop at once: Ctrl-C again", flush=True)
+            return
+        self._release()
+        os.kill(os.getpid(), number)
+
+    def _release(self) -> None:
+        for number, handler in self._replaced_handlers.items():
+            signal.signal(number, handler)
+        self._replaced_handlers = {}
+        if self._folder is not None:
+            self._folder.close()
+            self._folder = None
+
+
+def _is_learning(model: BaseAlgorithm, frame: FrameType | None) -> bool:
+    """Whether a frame is within the model's ``learn()``, which SB3 leaves without a word to callbacks when an error ends it."""
+    while frame is not None:
+        if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
+            return True
+        frame = frame.f_back
+    return False

@@ -1,0 +1,100 @@
+"""What a training is, in words that can be compared: to name what differs when it is resumed."""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+# Arguments that do not change what is learned, are described by themselves, or are changed by callbacks
+_OTHER_ARGUMENTS = frozenset(
+    {
+        *("device", "verbose", "tensorboard_log", "monitor_wrapper", "_init_setup_model"),
+        *("policy", "env", "learning_starts"),
+    }
+)
+
+
+def describe_model(model: BaseAlgorithm) -> dict[str, str]:
+    """
+    :param model: A model
+    :return: Its class and policy, and its hyperparameters as they are now; those that words cannot tell are left out
+    """
+    names = {name for kind in type(model).__mro__ for name in inspect.signature(kind.__init__).parameters}
+    words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
+    for name in sorted(names - _OTHER_ARGUMENTS):
+        value = _word(vars(model).get(name, inspect.Parameter.empty))
+        if value is not None:
+            words[name] = value
+    return words
+
+
+def describe_env(env: VecEnv) -> dict[str, str]:
+    """
+    :param env: A vectorised environment
+    :return: What it is made of, and its spaces
+    """
+    layers, layer = [type(env).__name__], env
+    while hasattr(layer, "venv"):
+        layer = layer.venv
+        layers.append(type(layer).__name__)
+    try:
+        name = env.env_method("__str__", indices=0)[0]
+    except AttributeError:  # not made of single environments
+        name = layers[-1]
+    return {
+        "environment": name,
+        "number of environments": str(env.num_envs),
+        "observation space": str(env.observation_space),
+        "action space": str(env.action_space),
+        "vectorised wrappers": ", ".join(layers[:-1]) or "none",
+    }
+
+
+def describe_callbacks(callbacks: Mapping[str, BaseCallback]) -> dict[str, str]:
+    """
+    :param callbacks: All callbacks of ``learn()`` by names
+    :return: Their classes
+    """
+    return {name: type(callback).__name__ for name, callback in callbacks.items()}
+
+
+def check_same(saved: Mapping[str, str], present: Mapping[str, str], advice: str) -> None:
+    """
+    :param saved: A description of the training that was saved
+    :param present: The same of the training that is to go on
+    :param advice: What to do when they differ
+    :raises ValueError: Naming all that differs
+    """
+    differences = [
+        f"{name} was {saved.get(name, 'absent')} and is {present.get(name, 'absent')}"
+        for name in sorted({*saved, *present})
+        if saved.get(name) != present.get(name)
+    ]
+    if differences:
+        raise ValueError(f"The training that was saved differs from this one: {'; '.join(differences)}. {advice}")
+
+
+def _word(value: Any) -> str | None:
+    """A value in words; a schedule by three of its values; None for what cannot be told."""
+    if isinstance(value, type):
+        return value.__name__ if value is not inspect.Parameter.empty else None
+    if isinstance(value, Mapping):
+        words = {str(key): _word(entry) for key, entry in value.items()}
+        return None if None in words.values() else str(words)
+    if isinstance(value, (list, tuple)):
+        items = [_word(entry) for entry in value]
+        return None if None in items else f"[{', '.join(map(str, items))}]"
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return repr(value)
+    if callable(value):
+        try:
+            return f"schedule {[float(value(progress)) for progress in (1.0, 0.5, 0.0)]}"
+        except Exception:  # no schedule
+            return None
+    return None

@@ -1,0 +1,199 @@
+"""All that the rest of a training depends on, besides what Stable-Baselines3 saves with a model."""
+
+import inspect
+import random
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr, recursive_setattr
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cchain.checkpoint.chunks import ChunkStore
+from sb3_cchain.checkpoint.environment_state import environment_state, restore_environment
+from sb3_cchain.checkpoint.object_state import object_states, restore_objects
+from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
+from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
+
+# Of a model: what is saved in other ways, and what belongs to the present process and its learn()
+_SKIPPED_OF_MODEL = frozenset(
+    {
+        *("policy", "device", "_logger", "_custom_logger", "verbose", "tensorboard_log"),
+        *("start_time", "_num_timesteps_at_start", "_total_timesteps"),
+    }
+)
+# Of a callback: what the present learn() gives it
+_SKIPPED_OF_CALLBACK = frozenset({"model", "parent", "locals", "globals", "_start_time"})
+# What gSDE draws before a rollout begins
+_GSDE_NOISE = ("exploration_mat", "exploration_matrices")
+# What was recorded and not yet written
+_PENDING = ("name_to_value", "name_to_count", "name_to_excluded")
+# Of a model: the episodes under way
+_EPISODE = ("_last_obs", "_last_episode_starts", "_last_original_obs")
+
+
+class TrainingParts(NamedTuple):
+    """
+    The objects of a training that have state.
+
+    :param model: The model
+    :param callbacks: All callbacks of ``learn()``, in the order in which they are nested
+    :param envs: The environments by name: ``env`` and those that callbacks evaluate in
+    """
+
+    model: BaseAlgorithm
+    callbacks: dict[str, BaseCallback]
+    envs: dict[str, VecEnv]
+
+    @property
+    def known(self) -> dict[str, object]:
+        """Objects that others refer to, by names that mean the same ones in another process."""
+        model = self.model
+        known: dict[str, object] = {"model": model, "logger": model.logger, **self.callbacks}
+        for name in ("rollout_buffer", "replay_buffer"):
+            if getattr(model, name, None) is not None:
+                known[name] = getattr(model, name)
+        for name in model._get_torch_save_params()[1]:
+            variable = recursive_getattr(model, name)
+            if variable is not None:
+                known[f"variable {name}"] = variable
+        known.update({f"optimizer {name}": optimizer for name, optimizer in model_optimizers(model).items()})
+        known.update({f"module {name}": module for name, module in model.policy.named_modules()})
+        known.update({f"parameter {name}": parameter for name, parameter in model.policy.named_parameters()})
+        known.update({f"buffer {name}": buffer for name, buffer in model.policy.named_buffers()})
+        for name, env in self.envs.items():
+            known.update({f"{name} layer {number}": layer for number, layer in enumerate(env_layers(env))})
+        return known
+
+
+def training_parts(model: BaseAlgorithm, callback: BaseCallback) -> TrainingParts:
+    """
+    :param model: A model in ``learn()``
+    :param callback: All callbacks of ``learn()``
+    :return: The objects that have state
+    """
+    assert model.env is not None
+    # A list has no state, and may stand for a single callback
+    found_callbacks = [found for found in iterate_callbacks(callback) if not isinstance(found, CallbackList)]
+    callbacks = {f"callback {number}": found for number, found in enumerate(found_callbacks)}
+    envs = {"env": model.env}
+    for name, found in callbacks.items():
+        envs.update({f"{name} {key}": value for key, value in vars(found).items() if _is_other_env(value, model.env)})
+    return TrainingParts(model, callbacks, envs)
+
+
+def env_layers(env: VecEnv) -> Iterator[VecEnv]:
+    """
+    :param env: A vectorised environment
+    :return: It and what it wraps, from outside to inside
+    """
+    yield env
+    while hasattr(env, "venv"):
+        env = env.venv
+        yield env
+
+
+def _is_other_env(value: object, env: VecEnv) -> bool:
+    return isinstance(value, VecEnv) and all(value is not layer for layer in env_layers(env))
+
+
+def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> tuple[dict[str, Any], list[str]]:
+    """
+    :param parts: The objects of a training, between two rollouts
+    :param store: Takes the big arrays
+    :param with_envs: Whether the environments' state is part of it
+    :return: The state, which can be pickled, without what is in the model's own file; and the names of attributes that cannot
+        be saved
+    """
+    model, callbacks, known = parts.model, parts.callbacks, parts.known
+    left_out: list[str] = []
+    skip = {"model": _SKIPPED_OF_MODEL, **{name: _SKIPPED_OF_CALLBACK | _settings(found) for name, found in callbacks.items()}}
+    buffer = getattr(model, "replay_buffer", None)
+    state = {
+        "objects": object_states({"model": model, **callbacks}, known, skip=skip, left_out=left_out),
+        "gsde_noise": [
+            {name: vars(noise)[name].detach() for name in _GSDE_NOISE if name in vars(noise)} for noise in _gsde(model)
+        ],
+        "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, known),
+        "envs": {name: environment_state(env) for name, env in parts.envs.items()} if with_envs else None,
+        "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
+        "random": _random_state(),
+    }
+    return state, left_out
+
+
+def _settings(callback: BaseCallback) -> set[str]:
+    """Arguments with which a callback was made, such as the files that it writes: those of the present process."""
+    return {name for kind in type(callback).__mro__ for name in inspect.signature(kind.__init__).parameters}
+
+
+def chunk_names(state: Mapping[str, Any]) -> list[str]:
+    """
+    :param state: What :func:`training_state` returned
+    :return: The pieces in the store that it refers to
+    """
+    buffer = state["replay_buffer"]
+    return [] if buffer is None else [name for names in buffer["arrays"] for name in names]
+
+
+def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path: Path, store: ChunkStore) -> None:
+    """
+    :param parts: The objects of a training that was set up as the saved one was, before its first rollout
+    :param state: What :func:`training_state` returned
+    :param model_path: The model's own file
+    :param store: The big arrays
+    """
+    model, known = parts.model, parts.known
+    _restore_parameters(model, model_path)
+    fresh = {name: vars(model)[name] for name in _EPISODE if name in vars(model)}
+    restore_objects({"model": model, **parts.callbacks}, state["objects"], known)
+    for noise, saved in zip(_gsde(model), state["gsde_noise"], strict=True):
+        vars(noise).update(saved)
+    if state["replay_buffer"] is not None:
+        restore_replay_buffer(model.replay_buffer, state["replay_buffer"], store, known)  # type: ignore[attr-defined]
+    if state["envs"] is None:
+        vars(model).update(fresh)
+    else:
+        for name, env in parts.envs.items():
+            restore_environment(env, state["envs"][name])
+    for name, values in state["logged"].items():
+        vars(model.logger)[name].clear()
+        vars(model.logger)[name].update(values)
+    _restore_random_state(state["random"])
+
+
+def _restore_parameters(model: BaseAlgorithm, path: Path) -> None:
+    _, parameters, variables = load_from_zip_file(path, load_data=False, device=model.device)
+    # Of the base class: churn reduction starts over in its own
+    BaseAlgorithm.set_parameters(model, parameters, exact_match=True, device=model.device)
+    for name, variable in (variables or {}).items():
+        if variable is not None:
+            recursive_setattr(model, f"{name}.data", variable.data)
+
+
+def _gsde(model: BaseAlgorithm) -> list[StateDependentNoiseDistribution]:
+    distributions = [getattr(module, "action_dist", None) for module in model.policy.modules()]
+    return [found for found in distributions if isinstance(found, StateDependentNoiseDistribution)]
+
+
+def _random_state() -> dict[str, Any]:
+    return {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(),
+        "torch": th.get_rng_state(),
+        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+    }
+
+
+def _restore_random_state(state: Mapping[str, Any]) -> None:
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])
+    th.set_rng_state(state["torch"])
+    if th.cuda.is_available() and len(state["cuda"]) == th.cuda.device_count():
+        th.cuda.set_rng_state_all(state["cuda"])
