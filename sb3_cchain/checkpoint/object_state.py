@@ -30,6 +30,9 @@ KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, propert
 # They are copied as a whole
 DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
 
+# Packages of windows and pictures, which belong to the process, too
+DISPLAYS = frozenset({"pygame", "glfw", "OpenGL", "matplotlib"})
+
 # What changes in a space: the random numbers of its samples
 SPACE_STATE = ("_np_random", "spaces")
 
@@ -49,6 +52,28 @@ def register_copy(kind: type, copy_into: Callable[[Any, Any], None]) -> None:
     :param copy_into: Copies the state into its first argument from its second
     """
     _COPY_INTO[kind] = copy_into
+
+
+class _OwnState(NamedTuple):
+    kind: type
+    read: Callable[[Any], Any]
+    restore: Callable[[Any, Any], None]
+
+
+# Types whose objects cannot have `state_dict()`, because their code is not ours
+_OWN_STATES: list[_OwnState] = []
+
+
+def register_state(kind: type, read: Callable[[Any], Any], restore: Callable[[Any, Any], None]) -> None:
+    """
+    Say what the state of a type of objects is, as ``state_dict()`` and ``load_state_dict()`` do where they can be written.
+
+    :param kind: The type; its subclasses are meant, too
+    :param read: Returns the state of an object, which can be pickled
+    :param restore: Puts into its first argument the state that is its second
+    """
+    if all(own.kind is not kind for own in _OWN_STATES):
+        _OWN_STATES.append(_OwnState(kind, read, restore))
 
 
 class NotSaved(ValueError):
@@ -185,8 +210,9 @@ class _Reader:
 
     def holder(self, holder: object, name: str, skip: Collection[str]) -> Any:
         self._packages = {"sb3_cchain", *map(_package, type(holder).__mro__)} - {"builtins"}
-        if _has_state_dict(holder):
-            return StateDict(self._number(holder), self._pickled(holder.state_dict()))
+        own = _own_state(holder)
+        if own is not None:
+            return StateDict(self._number(holder), self._pickled(own.read(holder)))
         return self._attributes(holder, name, skip)
 
     def _attributes(self, holder: object, path: str, skip: Collection[str] = ()) -> Attributes:
@@ -201,14 +227,15 @@ class _Reader:
         return Attributes(number, _class_name(type(holder)), values)
 
     def _state(self, value: Any, path: str) -> Any:
-        if isinstance(value, KEPT):
+        if _is_kept(value):
             return None
         if id(value) in self._known:
             return Known(self._known[id(value)])
         if id(value) in self._numbers:
             return Same(self._numbers[id(value)])
-        if _has_state_dict(value):
-            return StateDict(self._number(value), self._pickled(value.state_dict()))
+        own = _own_state(value)
+        if own is not None:
+            return StateDict(self._number(value), self._pickled(own.read(value)))
         if self._is_entered(value):
             return self._attributes(value, path)
         try:
@@ -248,6 +275,8 @@ class _Writer:
     def _fill(self, holder: object, state: Attributes) -> None:
         for name, value in state.values.items():
             old = vars(holder).get(name)
+            if _is_kept(old):
+                continue
             new = self._value(old, value)
             if new is not old:
                 vars(holder)[name] = new
@@ -266,8 +295,9 @@ class _Writer:
             return old
         if isinstance(state, StateDict):
             self._values[state.number] = old
-            if _has_state_dict(old):  # not None, as the file of a training that writes none
-                old.load_state_dict(self._unpickled(state.content))
+            own = _own_state(old)
+            if own is not None:  # not an object that this process does without, such as a file
+                own.restore(old, self._unpickled(state.content))
             return old
         new = self._unpickled(state.content)
         if type(old) is type(new) and type(new) in _COPY_INTO:
@@ -330,8 +360,16 @@ def _is_data(value: object) -> bool:
     return isinstance(value, DATA) or type(value) in _COPY_INTO or not hasattr(value, "__dict__")
 
 
-def _has_state_dict(value: object) -> bool:
-    return hasattr(value, "state_dict") and hasattr(value, "load_state_dict")
+def _is_kept(value: object) -> bool:
+    return isinstance(value, KEPT) or _package(type(value)) in DISPLAYS
+
+
+def _own_state(value: object) -> _OwnState | None:
+    kind = type(value)
+    # Of the class, because wrappers may pass on what their objects are asked for
+    if hasattr(kind, "state_dict") and hasattr(kind, "load_state_dict"):
+        return _OwnState(kind, kind.state_dict, kind.load_state_dict)
+    return next((own for own in _OWN_STATES if isinstance(value, own.kind)), None)
 
 
 def _package(kind: type) -> str:

@@ -3,6 +3,7 @@
 import gc
 import sys
 from collections.abc import Sequence
+from copy import deepcopy
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -185,6 +186,33 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         self._observation = observation
         return observation, float(rewards[0]), terminated, False, {}
 
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: The state of the game, from which it goes on in another process
+        """
+        return {
+            "game": None if self._game is None else self._game.get_state(),
+            "observation": _copy(self._observation),
+            "next_observation": _copy(self._next_observation),
+            "np_random": deepcopy(self._np_random),
+            "np_random_seed": self._np_random_seed,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        Go on from a state.
+
+        :param state: What ``state_dict()`` of the same game returned
+        """
+        if state["game"] is None:
+            self.close()
+        else:
+            if self._game is None:
+                self._game = self.launch(1, 0, num_threads=0)
+            self._game.set_state(state["game"])
+        self._observation, self._next_observation = _copy(state["observation"]), _copy(state["next_observation"])
+        self._np_random, self._np_random_seed = deepcopy(state["np_random"]), state["np_random_seed"]
+
     def render(self) -> NDArray[np.uint8] | None:
         """
         :return: The last observation, enlarged to ``(512, 512, 3)``; ``None`` without a render mode or before a reset
@@ -250,6 +278,10 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
     def task_sequence(self) -> list[tuple[str, int, int]]:
         """The game of each task, its first level and its number of levels."""
         return [(self.game, levels.start, len(levels)) for levels in self.levels]
+
+
+def _copy(observation: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+    return None if observation is None else observation.copy()
 
 
 def _check_game(game: str, distribution_mode: str) -> None:

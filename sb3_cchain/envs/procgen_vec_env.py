@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -74,10 +75,13 @@ class ContinualProcgenVecEnv(VecEnv):
     def _launch(self) -> None:
         self.close()
         assert self._rng is not None
+        self._games = self._make_games(int(self._rng.integers(2**31)))
+        self._observations = self._games.observe()[1]["rgb"]
+
+    def _make_games(self, rand_seed: int) -> "ProcgenGym3Env":
         task = self._sequence.task
         assert isinstance(task, ProcgenGame)
-        self._games = task.launch(self.num_envs, int(self._rng.integers(2**31)), num_threads=self._num_threads)
-        self._observations = self._games.observe()[1]["rgb"]
+        return task.launch(self.num_envs, rand_seed, num_threads=self._num_threads)
 
     def _begin_episodes(self, indices: Sequence[int] | NDArray[np.int64]) -> None:
         for index in indices:
@@ -133,6 +137,42 @@ class ContinualProcgenVecEnv(VecEnv):
         self._begin_episodes(ended)
         # A copy, as the next step may give them as terminal observations
         return self._observations.copy(), rewards, dones, infos
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: The state of all instances, from which they go on in another process
+        """
+        return deepcopy(
+            {
+                "clock": vars(self._sequence.clock),
+                "games": None if self._games is None else self._games.get_state(),
+                "observations": self._observations,
+                "returns": self._returns,
+                "rng": self._rng,
+                "reset_infos": self.reset_infos,
+                "seeds": self._seeds,
+                "options": self._options,
+                "action_random": self.action_space._np_random,
+                "observation_random": self.observation_space._np_random,
+            }
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        Go on from a state.
+
+        :param state: What ``state_dict()`` returned, of as many instances of the same games
+        """
+        state = deepcopy(state)
+        vars(self._sequence.clock).update(state["clock"])
+        # Only in a game of the right levels
+        self.close()
+        if state["games"] is not None:
+            self._games = self._make_games(0)
+            self._games.set_state(state["games"])
+        self._observations, self._returns, self._rng = state["observations"], state["returns"], state["rng"]
+        self.reset_infos, self._seeds, self._options = state["reset_infos"], state["seeds"], state["options"]
+        self.action_space._np_random, self.observation_space._np_random = state["action_random"], state["observation_random"]
 
     def close(self) -> None:
         """End all games. A ``reset()`` begins others."""

@@ -1,0 +1,236 @@
+"""The state of a single environment with its wrappers."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.core import ActType, ObsType
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
+from sb3_cchain.checkpoint.mujoco_state import register_mujoco
+from sb3_cchain.checkpoint.object_state import Attributes, NotSaved, object_states, restore_objects
+from sb3_cchain.envs.continual_env import ContinualEnv
+
+
+class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
+    """
+    Lets training that is stopped go on in the middle of an episode, exactly as if it had not been stopped. It must be the
+    outermost wrapper. ``SubprocVecEnv`` needs it, because its environments are in other processes::
+
+        make_vec_env(env_id, n_envs=8, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableEnv)
+
+    :param env: The environment
+    """
+
+    def __init__(self, env: gym.Env[ObsType, ActType]):
+        super().__init__(env)
+        # Not done before the environment is used for the first time, so that errors reach the process that trains
+        self._fault = attempt(make_resumable, self, begun=False)[0]
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """That of the environment, as this wrapper changes nothing."""
+        return self.env.spec
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: The state of the environment and its wrappers, which can be pickled and does not change any more
+        :raises ValueError: When the environment cannot be saved
+        """
+        return single_environment_state(self)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        Put a state back.
+
+        :param state: What ``state_dict()`` returned
+        :raises ValueError: When the environment is another one
+        """
+        restore_single_environment(self, state)
+
+    def resume_fault(self) -> str | None:
+        """
+        :return: Why the environment cannot be resumed, if it cannot
+        """
+        # What a reset adds may need to be recorded, too
+        return self._fault or attempt(make_resumable, self)[0]
+
+    def can_save(self) -> bool:
+        """
+        :return: Whether the present episode can be saved
+        """
+        return can_save_single_environment(self)
+
+    def attempt_state(self) -> tuple[str | None, Any]:
+        """
+        ``state_dict()`` for other processes, where an error would end the process of the environment.
+
+        :return: The error, if there was one, and the state
+        """
+        return attempt(self.state_dict)
+
+    def attempt_load(self, state: dict[str, Any]) -> tuple[str | None, Any]:
+        """
+        ``load_state_dict()`` for other processes.
+
+        :param state: What ``state_dict()`` returned
+        :return: The error, if there was one
+        """
+        return attempt(self.load_state_dict, state)
+
+
+def attempt(function: Any, *args: Any, **kwargs: Any) -> tuple[str | None, Any]:
+    """
+    :param function: Any
+    :param args: Its arguments
+    :param kwargs: Its keyword arguments
+    :return: The message of the ValueError that it raised, or what it returned
+    """
+    try:
+        return None, function(*args, **kwargs)
+    except ValueError as error:
+        return str(error), None
+
+
+def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
+    """
+    Record the episodes of an environment, or of its tasks, where its state cannot be saved.
+
+    :param env: The environment. Wrappers are put into it, around what cannot be saved
+    :param begun: Whether it may have been reset already
+    :return: It, or a wrapper if that has to be around all
+    :raises ValueError: When the environment cannot be made resumable
+    """
+    register_mujoco()
+    chain = _chain(env)
+    base = chain[-1]
+    if isinstance(base, ContinualEnv):
+        for task_id, task in enumerate(base.tasks):
+            base.tasks[task_id] = make_resumable(task, begun=begun and task_id in base._seeded)
+    for position, layer in enumerate(chain):
+        fault = _fault(env, layer)
+        if fault is None:
+            continue
+        if isinstance(base, ContinualEnv):
+            raise ValueError(
+                f"{layer} cannot be resumed, because its state cannot be saved: {fault}. "
+                "Give its class `state_dict()` and `load_state_dict(state)`"
+            )
+        replay: gym.Env = EpisodeReplay(layer, begun=begun)
+        if position == 0:
+            return replay
+        outer = chain[position - 1]
+        assert isinstance(outer, gym.Wrapper)
+        outer.env = replay
+        break
+    return env
+
+
+def can_save_single_environment(env: gym.Env) -> bool:
+    """
+    :param env: An environment that :func:`make_resumable` returned
+    :return: Whether the beginning of its present episode was recorded, where that is needed
+    """
+    return all(layer.is_recorded for layer in _layers(env).values() if isinstance(layer, EpisodeReplay))
+
+
+def single_environment_state(env: gym.Env) -> dict[str, Any]:
+    """
+    :param env: An environment that :func:`make_resumable` returned
+    :return: Its state and that of its wrappers, by their names; it can be pickled and does not change any more
+    :raises ValueError: When the state cannot be saved
+    """
+    register_mujoco()
+    layers = _layers(env)
+    states = object_states(layers, _known(layers), skip=dict.fromkeys(layers, CONSTRUCTION), strict=True)
+    return {name: without_start_time(layers[name], state) for name, state in states.items()}
+
+
+def restore_single_environment(env: gym.Env, state: dict[str, Any]) -> None:
+    """
+    Put a state back.
+
+    :param env: An environment of the same kind, that :func:`make_resumable` returned and that was reset
+    :param state: What :func:`single_environment_state` returned
+    :raises ValueError: When the environment has other wrappers
+    """
+    register_mujoco()
+    layers = _layers(env)
+    check_same_layers(layers, state)
+    restore_objects(layers, state, _known(layers))
+
+
+def without_start_time(layer: object, state: Any) -> Any:
+    """
+    :param layer: A wrapper
+    :param state: Its state
+    :return: The state without the time at which a monitor was made, from which it counts in its file
+    """
+    if isinstance(state, Attributes) and isinstance(layer, Monitor):
+        state.values.pop("t_start", None)
+    return state
+
+
+def check_same_layers(layers: Mapping[str, object], state: Mapping[str, Any]) -> None:
+    """
+    :param layers: Environment and wrappers, by their names
+    :param state: State of such ones
+    :raises ValueError: Naming the first one that differs
+    """
+    present, saved = list(layers), list(state)
+    if present == saved:
+        return
+    shorter = min(len(present), len(saved))
+    position = next((i for i in range(shorter) if present[i] != saved[i]), shorter)
+    names = [found[position] if position < len(found) else "none" for found in (present, saved)]
+    raise ValueError(
+        f"The environment must be wrapped as the saved one was, but it has {names[0]!r} instead of {names[1]!r}. "
+        f"It has {', '.join(present)}; the saved one had {', '.join(saved)}"
+    )
+
+
+def _chain(env: gym.Env) -> list[gym.Env]:
+    """The environment and what it wraps, from the outside to the inside, down to where episodes are recorded."""
+    chain = [env]
+    while isinstance(env, gym.Wrapper) and not isinstance(env, EpisodeReplay):
+        env = env.env
+        chain.append(env)
+    return chain
+
+
+def _layers(env: gym.Env, prefix: str = "") -> dict[str, gym.Env]:
+    """All that has a state of its own, with the tasks of a continual environment."""
+    chain = _chain(env)
+    kept = [layer for layer in chain if not isinstance(layer, ResumableEnv)]
+    layers = {f"{prefix}{position} {type(layer).__name__}": layer for position, layer in enumerate(kept)}
+    if isinstance(chain[-1], ContinualEnv):
+        for task_id, task in enumerate(chain[-1].tasks):
+            layers.update(_layers(task, f"{prefix}task {task_id}, "))
+    return layers
+
+
+def _known(layers: Mapping[str, gym.Env]) -> dict[str, object]:
+    """What the layers refer to and is no state of theirs."""
+    known: dict[str, object] = {}
+    for name, layer in layers.items():
+        if isinstance(layer, ContinualEnv):
+            known[f"{name} tasks"] = layer.tasks
+        if isinstance(layer, gym.Wrapper):
+            known[f"{name} env"] = layer.env
+    return known
+
+
+def _fault(env: gym.Env, layer: gym.Env) -> str | None:
+    """Why the state of a layer cannot be saved, if it cannot."""
+    layers = _layers(env)
+    name = next((name for name, other in layers.items() if other is layer), None)
+    if name is None or isinstance(layer, EpisodeReplay):
+        return None
+    others = {other: known for other, known in layers.items() if other != name}
+    try:
+        object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=True)
+    except NotSaved as error:
+        return str(error)
+    return None
