@@ -53,7 +53,8 @@ class ReturnsFile:
         """
         :return: What the file holds
         """
-        return {"text": Path(self._file.name).read_text()}
+        with open(self._file.name, newline="") as file:
+            return {"text": file.read()}
 
     def load_state_dict(self, state: dict[str, str]) -> None:
         """

@@ -373,7 +373,7 @@ def _own_state(value: object) -> _OwnState | None:
 
 
 def _package(kind: type) -> str:
-    return kind.__module__.partition(".")[0]
+    return str(getattr(kind, "__module__", "")).partition(".")[0]  # some classes of C extensions have none
 
 
 def _class_name(kind: type) -> str:
