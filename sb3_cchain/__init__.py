@@ -5,6 +5,7 @@ import sb3_cchain.gym_notice  # noqa: F401  # isort: skip  # before Stable-Basel
 from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN, FiniteCheck
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
+from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, resume
 from sb3_cchain.envs import ContinualEnv, register_envs
 from sb3_cchain.networks import make_lean
 from sb3_cchain.tasks import TaskSync
@@ -20,9 +21,12 @@ __all__ = [
     "ContinualMetrics",
     "DoubleDQN",
     "FiniteCheck",
+    "ResumableEnv",
     "TaskSync",
     "TensorBoardOverview",
+    "TrainingCheckpoint",
     "make_lean",
+    "resume",
 ]
 
 register_envs()

@@ -1,6 +1,7 @@
 """Saved training: files that are either whole or absent, and going on from them."""
 
 from sb3_cchain.checkpoint.callbacks import SafeCheckpointCallback, SaveBestModel
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
 from sb3_cchain.checkpoint.files import (
     check_model_file,
     check_writable,
@@ -9,13 +10,22 @@ from sb3_cchain.checkpoint.files import (
     saved_timesteps,
     write_safely,
 )
+from sb3_cchain.checkpoint.resumable_env import ResumableEnv
+from sb3_cchain.checkpoint.resume import load_model, resume
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 
 __all__ = [
+    "Checkpoint",
+    "ResumableEnv",
     "SafeCheckpointCallback",
     "SaveBestModel",
+    "TrainingCheckpoint",
     "check_model_file",
     "check_writable",
+    "find_checkpoint",
+    "load_model",
     "load_statistics",
+    "resume",
     "save_model",
     "saved_timesteps",
     "write_safely",
