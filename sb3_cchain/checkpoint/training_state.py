@@ -115,7 +115,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     left_out: list[str] = []
     skip = {"model": _SKIPPED_OF_MODEL, **{name: _SKIPPED_OF_CALLBACK | _settings(found) for name, found in callbacks.items()}}
     buffer = getattr(model, "replay_buffer", None)
-    state = {
+    state: dict[str, Any] = {
         "objects": object_states({"model": model, **callbacks}, known, skip=skip, left_out=left_out),
         "gsde_noise": [
             {name: vars(noise)[name].detach() for name in _GSDE_NOISE if name in vars(noise)} for noise in _gsde(model)
@@ -125,6 +125,8 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
         "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
         "random": _random_state(),
     }
+    for name, env_state in (state["envs"] or {}).items():
+        left_out += [f"{name} {attribute}" for attribute in env_state["left_out"]]
     return state, left_out
 
 
