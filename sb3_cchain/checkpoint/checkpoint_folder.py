@@ -1,8 +1,8 @@
 """
 Checkpoints of a training on the disk.
 
-A folder of checkpoints holds ``step_000010000``, ``step_000020000`` and so on, each of which is whole or absent, and ``chunks``,
-the pieces of their big arrays. Only one training writes to it at a time.
+A folder of checkpoints holds ``step_000000010000``, ``step_000000020000`` and so on, each of which is whole or absent, and
+``chunks``, the pieces of their big arrays. Only one training writes to it at a time.
 """
 
 import hashlib

@@ -86,7 +86,9 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     :raises ValueError: Naming what differs from the saved environment
     """
     if env.num_envs != state["n_envs"]:
-        raise ValueError(f"There must be {state['n_envs']} environments side by side, as when it was saved, got {env.num_envs}")
+        raise ValueError(
+            f"There must be {state['n_envs']} environments side by side, as when it was saved, got {env.num_envs}"
+        )
     layers = _vec_layers(env)
     check_same_layers(layers, state["layers"])
     prepare_environment(env)

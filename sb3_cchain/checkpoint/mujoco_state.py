@@ -27,7 +27,9 @@ def register_mujoco() -> None:
 def _model_state(model: Any) -> dict[str, Any]:
     arrays = _arrays(model)
     shapes = {name: zlib.crc32(arrays.pop(name)) for name in list(arrays) if name.startswith(SHAPES)}
-    options = {part: {name: np.array(value) for name, value in _values(getattr(model, part)).items()} for part in ("opt", "stat")}
+    options = {
+        part: {name: np.array(value) for name, value in _values(getattr(model, part)).items()} for part in ("opt", "stat")
+    }
     content = {name: zlib.compress(array.tobytes(), 1) for name, array in arrays.items()}
     return {"arrays": content, "options": options, "shapes": shapes}
 

@@ -1,5 +1,5 @@
 """
-The state of an object: what its attributes hold, to be put back into an object that was made in the same way in another process.
+The state of an object: what its attributes hold, to be put back into one that was made in the same way in another process.
 
 Objects stay the objects that they are, and only data is put back. So whoever else refers to them, such as hooks and closures,
 refers to the right one afterwards, and what cannot be saved, such as an open file, is that of the new process.

@@ -2,7 +2,6 @@
 
 import importlib
 from pathlib import Path
-from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -35,7 +34,8 @@ def resume(
     :param env: The environment, made as before
     :param callback: The callbacks that were given to ``learn()``, made as before and in the same order. The former
         TrainingCheckpoint may be left out where it was the last
-    :param total_timesteps: Environment steps at which training ends, those before the interruption included; by default as before
+    :param total_timesteps: Environment steps at which training ends, those before the interruption included; by default as
+        before
     :param logger: The logger; by default the model logs as it did, to the same folder for TensorBoard
     :param device: PyTorch device
     :return: The trained model
@@ -46,7 +46,7 @@ def resume(
     remaining = (checkpoint.total_timesteps if total_timesteps is None else total_timesteps) - checkpoint.num_timesteps
     if remaining <= 0:
         raise ValueError(
-            f"`total_timesteps` must be more than the {checkpoint.num_timesteps} steps that the model in {checkpoint.path} was "
+            f"`total_timesteps` must be more than {checkpoint.num_timesteps}, the steps that the model in {checkpoint.path} was "
             f"trained for; got {total_timesteps or checkpoint.total_timesteps}"
         )
     model = load_model(checkpoint, env, device)
@@ -55,7 +55,7 @@ def resume(
     if logger is not None:
         model.set_logger(logger)
     callbacks = with_checkpoint(_as_list(callback), checkpoint)
-    model.learn(remaining, callbacks, reset_num_timesteps=False, **checkpoint.info["learn"])  # type: ignore[arg-type]
+    model.learn(remaining, callbacks, reset_num_timesteps=False, **checkpoint.info["learn"])
     return model
 
 

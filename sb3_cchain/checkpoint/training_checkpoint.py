@@ -1,4 +1,4 @@
-"""A callback that saves the whole training at intervals and when it is told to stop, and another learn() that goes on exactly."""
+"""A callback that saves the whole training at intervals and when it is told to stop, and that puts it back."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, package_versions
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
-from sb3_cchain.checkpoint.training_state import TrainingParts, chunk_names, restore_training, training_parts, training_state
+from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.validation import check_bool, check_number
 
@@ -25,24 +25,24 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 class TrainingCheckpoint(BaseCallback):
     """
-    Saves all that training depends on, so that :func:`~sb3_cchain.resume` goes on from there as if nothing had happened: to the
-    bit, on the CPU.
+    Saves all that training depends on, so that :func:`~sb3_cchain.resume` goes on from there as if nothing had happened: to
+    the bit, on the CPU.
 
-    It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were made,
-    and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it ends the
-    training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and learned from
-    before that. A second signal ends the training at once.
+    It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were
+    made, and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it
+    ends the training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and
+    learned from before that. A second signal ends the training at once.
 
-    With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in the
-    same rhythm.
+    With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
+    the same rhythm.
 
     Works with all algorithms of Stable-Baselines3 and sb3-contrib but ARS. The page "Stop and resume" says what is exact.
 
     :param save_freq: Environment steps from one checkpoint to the next
     :param path: Folder of the checkpoints. A training has a folder of its own
     :param keep: How many checkpoints stay
-    :param exact: Whether environments that cannot be resumed in the middle of an episode are refused. Otherwise all environments
-        begin new episodes when training is resumed
+    :param exact: Whether environments that cannot be resumed in the middle of an episode are refused. Otherwise all
+        environments begin new episodes when training is resumed
     :raises ValueError: Naming the argument that is out of its range. When training starts: for environments that cannot be
         resumed exactly, a folder of another training, or a second TrainingCheckpoint
     """
@@ -221,7 +221,7 @@ class TrainingCheckpoint(BaseCallback):
 
 
 def _is_learning(model: BaseAlgorithm, frame: FrameType | None) -> bool:
-    """Whether a frame is within the model's ``learn()``, which SB3 leaves without a word to callbacks when an error ends it."""
+    """Whether a frame is within the model's ``learn()``: SB3 does not tell callbacks when an error ends it."""
     while frame is not None:
         if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
             return True

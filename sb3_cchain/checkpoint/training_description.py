@@ -23,7 +23,7 @@ def describe_model(model: BaseAlgorithm) -> dict[str, str]:
     :param model: A model
     :return: Its class and policy, and its hyperparameters as they are now; those that words cannot tell are left out
     """
-    names = {name for kind in type(model).__mro__ for name in inspect.signature(kind.__init__).parameters}
+    names = {name for kind in type(model).__mro__ for name in inspect.signature(kind.__init__).parameters  # type: ignore[misc]}
     words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
     for name in sorted(names - _OTHER_ARGUMENTS):
         value = _word(vars(model).get(name, inspect.Parameter.empty))

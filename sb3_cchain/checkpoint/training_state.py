@@ -132,7 +132,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
 
 def _settings(callback: BaseCallback) -> set[str]:
     """Arguments with which a callback was made, such as the files that it writes: those of the present process."""
-    return {name for kind in type(callback).__mro__ for name in inspect.signature(kind.__init__).parameters}
+    return {name for kind in type(callback).__mro__ for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
 
 
 def chunk_names(state: Mapping[str, Any]) -> list[str]:
