@@ -18,12 +18,21 @@ _OTHER_ARGUMENTS = frozenset(
 )
 
 
+def constructor_arguments(kind: type) -> set[str]:
+    """
+    :param kind: A class
+    :return: Names of the arguments of its constructor, and of those of the classes that it derives from
+    """
+    constructors = [vars(base)["__init__"] for base in kind.__mro__ if "__init__" in vars(base)]
+    return {name for constructor in constructors for name in inspect.signature(constructor).parameters}
+
+
 def describe_model(model: BaseAlgorithm) -> dict[str, str]:
     """
     :param model: A model
     :return: Its class and policy, and its hyperparameters as they are now; those that words cannot tell are left out
     """
-    names = {name for kind in type(model).__mro__ for name in inspect.signature(kind.__init__).parameters  # type: ignore[misc]}
+    names = constructor_arguments(type(model))
     words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
     for name in sorted(names - _OTHER_ARGUMENTS):
         value = _word(vars(model).get(name, inspect.Parameter.empty))

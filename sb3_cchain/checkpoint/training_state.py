@@ -1,6 +1,5 @@
 """All that the rest of a training depends on, besides what Stable-Baselines3 saves with a model."""
 
-import inspect
 import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.environment_state import environment_state, restore_environment
 from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
+from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 
@@ -113,7 +113,11 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     """
     model, callbacks, known = parts.model, parts.callbacks, parts.known
     left_out: list[str] = []
-    skip = {"model": _SKIPPED_OF_MODEL, **{name: _SKIPPED_OF_CALLBACK | _settings(found) for name, found in callbacks.items()}}
+    # Callbacks keep the arguments with which the present process made them, such as the files that they write
+    skip = {
+        "model": _SKIPPED_OF_MODEL,
+        **{name: _SKIPPED_OF_CALLBACK | constructor_arguments(type(found)) for name, found in callbacks.items()},
+    }
     buffer = getattr(model, "replay_buffer", None)
     state: dict[str, Any] = {
         "objects": object_states({"model": model, **callbacks}, known, skip=skip, left_out=left_out),
@@ -128,11 +132,6 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     for name, env_state in (state["envs"] or {}).items():
         left_out += [f"{name} {attribute}" for attribute in env_state["left_out"]]
     return state, left_out
-
-
-def _settings(callback: BaseCallback) -> set[str]:
-    """Arguments with which a callback was made, such as the files that it writes: those of the present process."""
-    return {name for kind in type(callback).__mro__ for name in inspect.signature(kind.__init__).parameters}  # type: ignore[misc]
 
 
 def chunk_names(state: Mapping[str, Any]) -> list[str]:
