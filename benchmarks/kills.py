@@ -27,7 +27,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, TrainingCheckpoint, resume
-from sb3_cchain.checkpoint import find_checkpoint
+from sb3_cchain.checkpoint import find_checkpoint, has_checkpoint
 
 
 def make_env() -> VecEnv:
@@ -66,7 +66,7 @@ def train(algorithm: str, n_steps: int, save_freq: int, folder: Path) -> None:
     warnings.simplefilter("ignore")  # of older checkpoints that are taken: those are counted below
     checkpoints, callback = folder / "checkpoints", ContinualMetrics(folder / "returns.csv")
     logger = configure(str(folder), [])
-    if any(checkpoints.glob("step_*")):
+    if has_checkpoint(checkpoints):
         model = resume(checkpoints, make_env(), [callback], logger=logger)
     else:
         model = ALGORITHMS[algorithm]()
@@ -143,7 +143,7 @@ def compare(algorithm: str, args: argparse.Namespace, folder: Path, console: Con
         os.kill(process.pid, signal.SIGKILL)
         process.join()
         n_kills += 1
-        n_restarts += not any((killed / "checkpoints").glob("step_*"))
+        n_restarts += not has_checkpoint(killed / "checkpoints")
         n_damaged += damaged(killed / "checkpoints")
     last = context.Process(target=train, args=(algorithm, *settings, killed))
     last.start()

@@ -1,7 +1,7 @@
 """Saved training: files that are either whole or absent, and going on from them."""
 
 from sb3_cchain.checkpoint.callbacks import SafeCheckpointCallback, SaveBestModel
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint
 from sb3_cchain.checkpoint.files import (
     check_model_file,
     check_writable,
@@ -23,6 +23,7 @@ __all__ = [
     "check_model_file",
     "check_writable",
     "find_checkpoint",
+    "has_checkpoint",
     "load_model",
     "load_statistics",
     "resume",

@@ -125,6 +125,14 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
     raise ValueError(f"{path} holds no whole checkpoint")
 
 
+def has_checkpoint(path: str | Path) -> bool:
+    """
+    :param path: A folder of checkpoints, which need not exist
+    :return: Whether there is a checkpoint in it, whole or not
+    """
+    return bool(_step_folders(Path(path)))
+
+
 def _whole(path: Path) -> Checkpoint | None:
     try:
         return Checkpoint(path)
