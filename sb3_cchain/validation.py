@@ -1,6 +1,7 @@
 """Checks of arguments, with errors that name the argument, its value and what is allowed."""
 
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -49,6 +50,17 @@ def check_bool(name: str, value: Any) -> None:
     """
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"`{name}` must be True or False, got {value!r}")
+
+
+def check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
+    """
+    :param name: The argument's name
+    :param value: Its value
+    :param allowed: The values allowed
+    :raises ValueError: When it is none of them
+    """
+    if value not in tuple(allowed):
+        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 
 def check_list(name: str, value: Any, of: str) -> list[Any]:

@@ -33,7 +33,7 @@ from sb3_cchain.networks.policy_outputs import (
     policy_values,
 )
 from sb3_cchain.replaced import replaced
-from sb3_cchain.validation import check_number
+from sb3_cchain.validation import check_choice, check_number
 
 # β when `target_churn_ratio="auto"`. The paper uses 1e3, 1e4 (default of the released code) or 1e5 with the cross-entropy
 # of discrete policies, and 0.05 or 0.5 with the mean squared difference of action means.
@@ -109,13 +109,9 @@ class PolicyChurnOptions:
     churn_batch_size: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, allowed in (
-            ("churn_base_loss", BASE_LOSSES),
-            ("churn_component", COMPONENTS),
-            ("churn_reference", REFERENCES),
-        ):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"`{name}` must be one of {', '.join(map(repr, allowed))}, got {getattr(self, name)!r}")
+        check_choice("churn_base_loss", self.churn_base_loss, BASE_LOSSES)
+        check_choice("churn_component", self.churn_component, COMPONENTS)
+        check_choice("churn_reference", self.churn_reference, REFERENCES)
         check_number("churn_batch_size", self.churn_batch_size, minimum=0, exclusive=True)
 
 
