@@ -13,6 +13,7 @@ from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.algorithms import dqn_cchain, on_policy
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.churn_models import assert_close, assert_equal, differ, learn_in_double_precision, spied
@@ -146,18 +147,29 @@ DOUBLE_Q = (
 )
 MSE = ("F.smooth_l1_loss(", "F.mse_loss(")
 CHURN = [
+    ("self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)", "self.minibatch(batch_size)"),
     ("losses.append(loss.item())", "losses.append(loss.item())\nloss = loss + self.churn_term()"),
     ("self.policy.optimizer.zero_grad()", "self.remember(batch_size)\nself.policy.optimizer.zero_grad()"),
 ]
 
 
-def rewritten_dqn(*replacements):
+def rewritten_dqn(*replacements, reference="independent"):
     """SB3's DQN with its source changed."""
 
     class WrittenOutDQN(DQN):
         train = rewritten(DQN.train, *replacements)
-        pending = None
+        pending = following = None
         n_churn_terms = 0
+
+        def sample(self, batch_size):
+            return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+        def minibatch(self, batch_size):
+            if reference == "independent":
+                return self.sample(batch_size)
+            current = self.following or self.sample(batch_size)
+            self.following = self.sample(batch_size)
+            return current
 
         def churn_term(self):
             if self.pending is None:
@@ -167,9 +179,9 @@ def rewritten_dqn(*replacements):
             return COEF * th.nn.functional.mse_loss(self.q_net(reference), old)
 
         def remember(self, batch_size):
-            reference = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env).observations
+            observations = (self.following or self.sample(batch_size)).observations
             with th.no_grad():
-                self.pending = reference, self.q_net(reference)
+                self.pending = observations, self.q_net(observations)
 
     return WrittenOutDQN
 
@@ -195,10 +207,13 @@ def test_double_dqn_equals_sb3_source_with_other_targets_and_loss(double_q, loss
 @pytest.mark.parametrize("own_pass", [False, True])
 @pytest.mark.parametrize("max_grad_norm", [10, 0.05])
 @pytest.mark.parametrize("double_q, loss", [(True, "mse"), (False, "huber")])
-def test_dqn_equals_sb3_source_with_the_term_in_its_loss(double_q, loss, max_grad_norm, own_pass, monkeypatch):
+@pytest.mark.parametrize("churn_reference", REFERENCES)
+def test_dqn_equals_sb3_source_with_the_term_in_its_loss(
+    double_q, loss, max_grad_norm, own_pass, churn_reference, monkeypatch
+):
     arguments = dict(DQN_SETTINGS, max_grad_norm=max_grad_norm)
-    cchain = partial(CChainDQN, double_q=double_q, loss=loss, churn_coef=COEF)
-    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN)
+    cchain = partial(CChainDQN, double_q=double_q, loss=loss, churn_coef=COEF, churn_reference=churn_reference)
+    written_out = rewritten_dqn(*[DOUBLE_Q] * double_q, *[MSE] * (loss == "mse"), *CHURN, reference=churn_reference)
     if own_pass:
         monkeypatch.setattr(dqn_cchain, "has_training_mode", lambda policy: True)
         reference = written_out("MlpPolicy", "CartPole-v1", **arguments).learn(N_STEPS)

@@ -5,9 +5,11 @@ import pickle
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import PPO
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
+from tests.churn_models import assert_equal
 from tests.envs import RandomEnv
 
 
@@ -19,12 +21,21 @@ def make_dqn():
     return CChainDQN("MlpPolicy", RandomEnv(), learning_starts=4, batch_size=8, buffer_size=100, device="cpu")
 
 
+def make_dqn_ahead():
+    return CChainDQN(
+        *("MlpPolicy", RandomEnv()), learning_starts=4, batch_size=8, buffer_size=100, churn_reference="next", device="cpu"
+    )
+
+
 def pickled(model):
     return pickle.loads(pickle.dumps(model))
 
 
 # After training, deepcopy fails for PPO's policy as it does for SB3's own: it keeps its last distribution
-@pytest.mark.parametrize("make, duplicate", [(make_ppo, pickled), (make_dqn, pickled), (make_dqn, copy.deepcopy)])
+@pytest.mark.parametrize(
+    "make, duplicate",
+    [(make_ppo, pickled), *((make, how) for make in (make_dqn, make_dqn_ahead) for how in (pickled, copy.deepcopy))],
+)
 def test_a_copy_goes_on_and_saves_what_it_learned(make, duplicate, tmp_path):
     model = make().learn(48)
     n_seen = int(model.churn_reducer.coefficient.n_seen)
@@ -41,13 +52,25 @@ def test_a_copy_goes_on_and_saves_what_it_learned(make, duplicate, tmp_path):
     assert np.array_equal(saved.reference, kept.reference)
 
 
-@pytest.mark.parametrize("make", [make_ppo, make_dqn])
+@pytest.mark.parametrize("make", [make_ppo, make_dqn, make_dqn_ahead])
 def test_an_untrained_copy_has_a_reducer_of_its_own(make):
     model = make()
     other = copy.deepcopy(model)
     assert other.churn_state.model is other and other.churn_state.reducer is other.churn_reducer is not model.churn_reducer
     other.learn(48)
     assert int(other.churn_reducer.coefficient.n_seen) > 0 == int(model.churn_reducer.coefficient.n_seen)
+
+
+@pytest.mark.parametrize("duplicate", [pickled, copy.deepcopy])
+def test_a_copy_trains_on_the_minibatch_that_was_drawn_ahead(duplicate):
+    model = make_dqn_ahead().learn(48)
+    other = duplicate(model)
+    assert th.equal(other._next_minibatch.observations, other.churn_reducer.reference)
+    for each in (model, other):
+        np.random.seed(0)
+        each.train(gradient_steps=3, batch_size=8)
+    assert_equal(model, other)
+    assert model.logger.name_to_value["churn/loss"] > 0
 
 
 def test_a_stock_model_that_was_pickled_goes_on_with_the_callback(tmp_path):

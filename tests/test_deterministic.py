@@ -7,6 +7,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from tests.churn_models import ALGORITHMS, DQN_SETTINGS, PPO_SETTINGS, assert_equal
 
 
@@ -35,10 +36,12 @@ def test_without_double_q_and_coefficient_it_is_dqn_to_the_bit(n_envs, n_steps, 
         assert_same_training(plain, other)
 
 
-def test_zero_coefficient_is_double_dqn_to_the_bit():
+@pytest.mark.parametrize("churn_reference", REFERENCES)
+def test_zero_coefficient_is_double_dqn_to_the_bit(churn_reference):
     settings = dict(DQN_SETTINGS, target_update_interval=50)
     double = DoubleDQN("MlpPolicy", "CartPole-v1", **settings).learn(120)
-    assert_same_training(double, CChainDQN("MlpPolicy", "CartPole-v1", churn_coef=0.0, **settings).learn(120))
+    settings.update(churn_coef=0.0, churn_reference=churn_reference)
+    assert_same_training(double, CChainDQN("MlpPolicy", "CartPole-v1", **settings).learn(120))
 
 
 @pytest.mark.parametrize(

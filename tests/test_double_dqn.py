@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainDQN, ContinualEnv, DoubleDQN
 from sb3_cchain.algorithms import dqn_cchain
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.networks.extractors import MinAtarCNN
 from tests.churn_models import (
     DICT,
@@ -30,6 +31,7 @@ from tests.envs import CountEnv, RandomEnv
 
 SETTINGS = FORMS["CChainDQN"].settings
 learn = FORMS["CChainDQN"].learn
+each_reference = pytest.mark.parametrize("churn_reference", REFERENCES)
 
 
 def test_defaults():
@@ -49,8 +51,9 @@ def test_defaults():
     ],
     ids=["gradient steps", "as many as steps", "episodes", "n-step", "memory", "schedule"],
 )
-def test_other_arguments_of_dqn(arguments, n_updates):
-    model = learn(**arguments)
+@each_reference
+def test_other_arguments_of_dqn(arguments, n_updates, churn_reference):
+    model = learn(churn_reference=churn_reference, **arguments)
     assert model._n_updates == n_updates
     assert_churn_was_reduced(model)
     assert isinstance(model.replay_buffer, NStepReplayBuffer) == ("n_steps" in arguments)
@@ -68,26 +71,31 @@ def test_frozen_layers_stay_as_they_are(cls):
         assert_churn_was_reduced(model)
 
 
-def test_hindsight_experience_replay():
-    model = learn(BitFlippingEnv(n_bits=4), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+@each_reference
+def test_hindsight_experience_replay(churn_reference):
+    env = BitFlippingEnv(n_bits=4)
+    model = learn(env, "MultiInputPolicy", replay_buffer_class=HerReplayBuffer, churn_reference=churn_reference)
     assert_churn_was_reduced(model)
 
 
-@pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
+@pytest.mark.parametrize(
+    "cls", [DoubleDQN, CChainDQN, partial(CChainDQN, churn_reference="next")], ids=["DoubleDQN", *REFERENCES]
+)
 def test_batch_norm_and_dropout_act_as_in_the_environment(cls):
     """Only the observations of a minibatch move the running statistics: not its next observations, nor reference batches."""
     settings = {**SETTINGS, "policy_kwargs": dict(features_extractor_class=NormalisedExtractor)}
     model = cls("MlpPolicy", RandomEnv(), **settings).learn(50, log_interval=10**6)
     batches = []
     norm = model.q_net.features_extractor.net[1]
+    model.replay_buffer.next_observations[:] = 0.5
+    model.train(gradient_steps=1, batch_size=8)  # with "next", on a minibatch that was drawn before
     norm.register_forward_pre_hook(lambda module, inputs: batches.append((module.training, inputs[0])))
     n_batches = int(norm.num_batches_tracked)
-    model.replay_buffer.next_observations[:] = 0.5
     model.train(gradient_steps=1, batch_size=8)
     assert model.q_net.training and norm.num_batches_tracked == n_batches + 1
     ((_, trained_on),) = [batch for batch in batches if batch[0]]
     assert th.unique(trained_on, dim=0).shape[0] > 1  # next observations are all the same
-    if cls is CChainDQN:
+    if isinstance(model, CChainDQN):
         assert_churn_was_reduced(model)
         # Next observations, and the reference batch twice (before this update, and of the one before)
         assert len(batches) == 4
@@ -104,11 +112,13 @@ def other_settings(name):
 
 @pytest.mark.parametrize("double_q", [False, True])
 @pytest.mark.parametrize("name", ["Box", "Dict", "VecNormalize", "HER"])
-def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, monkeypatch):
+@each_reference
+def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, churn_reference, monkeypatch):
     models = []
+    settings = dict(double_q=double_q, churn_coef=10.0, gradient_steps=2, churn_reference=churn_reference)
     for own_pass in (False, True):
         monkeypatch.setattr(dqn_cchain, "has_training_mode", lambda policy, own_pass=own_pass: own_pass)
-        models.append(learn(n_timesteps=50, double_q=double_q, churn_coef=10.0, gradient_steps=2, **other_settings(name)))
+        models.append(learn(n_timesteps=50, **settings, **other_settings(name)))
     for p, q in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.allclose(p, q, rtol=0, atol=1e-5)
     together, alone = (model.logger.name_to_value for model in models)
@@ -123,14 +133,55 @@ class GenerousBuffer(ReplayBuffer):
 
 
 @pytest.mark.parametrize("double_q", [False, True])
-def test_a_custom_replay_buffer(double_q):
-    model = learn(replay_buffer_class=GenerousBuffer, double_q=double_q)
+@each_reference
+def test_a_custom_replay_buffer(double_q, churn_reference):
+    model = learn(replay_buffer_class=GenerousBuffer, double_q=double_q, churn_reference=churn_reference)
     assert_churn_was_reduced(model)
     assert len(model.churn_reducer.reference) == 16
 
 
-def test_an_interrupted_update_leaves_nothing_behind():
-    model = learn()
+def test_the_reference_batch_is_the_minibatch_of_the_next_update():
+    """Also across calls of train(), and after an update that failed."""
+    model = learn(churn_reference="next")
+    trained_on, measured_on = [], []
+    loss, remember = model._td_loss, model.churn_reducer.remember
+
+    def td_loss(replay_data, *args):
+        trained_on.append(replay_data.observations)
+        return loss(replay_data, *args)
+
+    def remember_reference(reference, outputs):
+        measured_on.append(reference)
+        remember(reference, outputs)
+
+    model._td_loss, model.churn_reducer.remember = td_loss, remember_reference
+    for gradient_steps in (1, 3, 2):
+        model.train(gradient_steps, batch_size=8)
+    assert len(trained_on) == len(measured_on) == 6
+    assert all(reference is minibatch for reference, minibatch in zip(measured_on[:-1], trained_on[1:], strict=True))
+
+    minibatch, rewards = model._next_minibatch, model._next_minibatch.rewards.clone()
+    minibatch.rewards[:] = np.nan
+    with pytest.raises(ValueError, match="rewards of the minibatch hold nan"):
+        model.train(1, batch_size=8)
+    minibatch.rewards[:] = rewards
+    model.train(1, batch_size=8)
+    assert trained_on[-2] is trained_on[-1] is measured_on[5] and len(measured_on) == 7
+
+
+def test_the_first_minibatch_is_that_of_double_dqn():
+    seen = []
+    for cls in (DoubleDQN, partial(CChainDQN, churn_reference="next")):
+        model = cls("MlpPolicy", RandomEnv(), **SETTINGS).learn(20)
+        loss = model._td_loss
+        model._td_loss = lambda replay_data, *args, loss=loss: seen.append(replay_data) or loss(replay_data, *args)
+        model.train(1, batch_size=8)
+    assert all(th.equal(*pair) for pair in zip(*(each[:5] for each in seen), strict=True))
+
+
+@each_reference
+def test_an_interrupted_update_leaves_nothing_behind(churn_reference):
+    model = learn(churn_reference=churn_reference)
     step = model.policy.optimizer.step
 
     def interrupt():
@@ -148,10 +199,11 @@ def test_an_interrupted_update_leaves_nothing_behind():
 
 
 @pytest.mark.parametrize("double_q", [False, True])
-def test_what_is_logged(double_q):
+@each_reference
+def test_what_is_logged(double_q, churn_reference):
     """Two updates in a call, so that the second has churn: computed from the networks before and after the first."""
-    settings = {**SETTINGS, "learning_rate": 0.1}
-    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=2.0, double_q=double_q, **settings).learn(20)
+    settings = {**SETTINGS, "learning_rate": 0.1, "double_q": double_q, "churn_reference": churn_reference}
+    model = CChainDQN("MlpPolicy", RandomEnv(), churn_coef=2.0, **settings).learn(20)
     reducer, seen = model.churn_reducer, []
 
     def remember(reference, outputs, remember=reducer.remember):
@@ -186,11 +238,13 @@ def test_logs_are_means_over_the_updates_between_two_logs(gradient_steps, n_upda
 
 
 @pytest.mark.parametrize("double_q", [False, True])
-def test_updates_of_one_call_are_those_of_several_calls(double_q):
+@each_reference
+def test_updates_of_one_call_are_those_of_several_calls(double_q, churn_reference):
     """λ, its warm-up and its window are counted in gradient updates."""
     models = []
+    churn = dict(churn_coef="auto_20", churn_warmup=3, churn_window=4, churn_reference=churn_reference)
     for calls in ([6], [1] * 6, [2, 4]):
-        settings = dict(double_q=double_q, churn_coef="auto_20", churn_warmup=3, churn_window=4)
+        settings = dict(double_q=double_q, **churn)
         models.append(CChainDQN("MlpPolicy", RandomEnv(), **SETTINGS, **settings).learn(20))
         np.random.seed(0)
         for gradient_steps in calls:
@@ -203,8 +257,9 @@ def test_updates_of_one_call_are_those_of_several_calls(double_q):
         assert first.churn_reducer.coefficient.value == other.churn_reducer.coefficient.value
 
 
-def test_no_update_is_held_until_the_call_ends():
-    model = learn()
+@each_reference
+def test_no_update_is_held_until_the_call_ends(churn_reference):
+    model = learn(churn_reference=churn_reference)
     outputs = []
 
     def remember(reference, old_outputs, remember=model.churn_reducer.remember):

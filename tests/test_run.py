@@ -143,10 +143,10 @@ BAD_CHURN_ARGUMENTS = [
     ("churn_warmup", 1.5),
     ("churn_window", 0),
     ("churn_coef_min", -1),
+    ("churn_reference", "previous"),
 ]
 BAD_POLICY_ARGUMENTS = [
     ("churn_base_loss", "value"),
-    ("churn_reference", "previous"),
     ("churn_batch_size", 0),
     ("churn_batch_size", "half"),
 ]

@@ -14,6 +14,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
 from tests.churn_models import (
@@ -86,6 +87,32 @@ def test_continues_as_if_never_stopped(tmp_path, name, action_space, observation
     # λ had adapted
     coefficient = model.churn_state.reducer.coefficient
     assert coefficient.value != 1 and coefficient.base_losses.all()
+
+
+def test_a_minibatch_that_was_drawn_ahead_is_not_saved(tmp_path):
+    """Nothing else is lost: given it, training goes on as if it had never stopped."""
+    form = FORMS["CChainDQN"]
+    model = learn(form, churn_reference="next")
+    loaded, without = (save_and_load(model, tmp_path) for _ in range(2))
+    assert loaded.churn_reference == "next"
+    data, _, _ = load_from_zip_file(tmp_path / "model")
+    assert "_next_minibatch" not in data and loaded._next_minibatch is None
+    loaded._next_minibatch = model._next_minibatch
+    for each in (model, loaded):
+        go_on(each)
+    assert_equal(model, loaded)
+
+    # Without it, the first update has no churn loss
+    n_seen = int(without.churn_reducer.coefficient.n_seen)
+    go_on(without)
+    assert without.churn_reducer.coefficient.n_seen == n_seen + 39
+    # Nor has one with other parameters
+    for parameters in (model.get_parameters(), tmp_path / "model.zip"):
+        without.set_parameters(parameters)
+        assert without._next_minibatch is None
+        n_seen = int(without.churn_reducer.coefficient.n_seen)
+        without.train(gradient_steps=3, batch_size=8)
+        assert without.churn_reducer.coefficient.n_seen == n_seen + 2
 
 
 @each_algorithm

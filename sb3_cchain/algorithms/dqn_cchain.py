@@ -8,10 +8,12 @@ from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSam
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
 from sb3_cchain.algorithms.off_policy import QValues, finite_td_loss, joint_pass, log_q_churn, make_q_reducer
+from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
+from sb3_cchain.validation import check_choice
 
 SelfCChainDQN = TypeVar("SelfCChainDQN", bound="CChainDQN")
 
@@ -24,7 +26,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
     It is :class:`~sb3_cchain.DoubleDQN`, which is SB3's :class:`~stable_baselines3.DQN` with all of its arguments, plus
     λ·L_churn in the loss of each update. L_churn is the change that the previous update made to the Q-network: the mean
-    squared change of all action values on an independent sample of the replay buffer.
+    squared change of all action values on another sample of the replay buffer than the minibatch of that update.
 
     Deviation from the code released with the paper: the reference batch is drawn, and the old outputs are computed, before
     the update instead of by a copy of the network after it.
@@ -42,9 +44,15 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     :param churn_window: Gradient updates that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes
+    :param churn_reference: Where reference batches are taken from, always drawn independently of the minibatch whose update
+        they measure: ``"independent"`` for a sample of their own, ``"next"`` for the minibatch that is trained on next, which
+        costs less because its outputs are needed anyway. Minibatches are then drawn one update ahead.
     :param kwargs: Keyword arguments of DoubleDQN
     :raises ValueError: Naming the churn argument that is out of its range
     """
+
+    # With `churn_reference="next"`, the minibatch that was drawn for the next update
+    _next_minibatch: ReplayBufferSamples | None
 
     def __init__(
         self,
@@ -52,16 +60,28 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
         churn_coef: float | str = "auto",
         churn_warmup: int = 0,
         churn_window: int = 1000,
+        churn_reference: str = "independent",
         **kwargs: Any,
     ):
+        self.churn_reference = churn_reference
         super().__init__(*args, churn_coef=churn_coef, churn_warmup=churn_warmup, churn_window=churn_window, **kwargs)
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_choice("churn_reference", self.churn_reference, REFERENCES)
+
     def _make_churn_reducer(self) -> ChurnReducer:
+        self._next_minibatch = None  # it waited with the reducer that is replaced
         return make_q_reducer(self, self._make_churn_coefficient)
+
+    def _excluded_save_params(self) -> list[str]:
+        # It belongs to the replay buffer, which is saved apart
+        return [*super()._excluded_save_params(), "_next_minibatch"]
 
     def _loss(self, replay_data: ReplayBufferSamples, batch_size: int) -> tuple[th.Tensor, float]:
         """
-        :param replay_data: A minibatch
+        :param replay_data: The minibatch that was just drawn. With ``churn_reference="next"`` it waits for the next update,
+            unless none was waiting for this one
         :param batch_size: Size of the reference batch
         :return: The TD loss plus λ·L_churn, and the value of the TD loss, which is logged
         """
@@ -71,7 +91,12 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
         # Independent of the minibatch. It waits for the next update, which measures on it what this update changes
         assert self.replay_buffer is not None
-        reference = sample_observations(self.replay_buffer, batch_size, self._vec_normalize_env)
+        next_minibatch = None
+        if self.churn_reference == "independent":
+            reference = sample_observations(self.replay_buffer, batch_size, self._vec_normalize_env)
+        else:
+            replay_data, next_minibatch = self._in_turn(replay_data, batch_size)
+            reference = next_minibatch.observations
         values = self._all_q_values(replay_data, reference)
 
         td_loss = self._td_loss(replay_data, values.current, values.next)
@@ -86,11 +111,28 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
             )
             reducer.end_iteration(td_loss_value)
         reducer.remember(reference, values.reference)
+        self._next_minibatch = next_minibatch
         return loss, td_loss_value
+
+    def _in_turn(self, drawn: ReplayBufferSamples, batch_size: int) -> tuple[ReplayBufferSamples, ReplayBufferSamples]:
+        """
+        :param drawn: The minibatch that was just drawn
+        :param batch_size: Size of a further one
+        :return: The minibatch to train on, and the next one
+        """
+        if self._next_minibatch is not None:
+            return self._next_minibatch, drawn
+        self.churn_reducer.forget_reference()  # a saved model's: the minibatch that it belongs to is not saved
+        assert self.replay_buffer is not None
+        return drawn, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
     def _all_q_values(self, replay_data: ReplayBufferSamples, reference: Observations) -> QValues:
         previous = self.churn_reducer.reference
         if not has_training_mode(self.q_net):
+            if self.churn_reference == "next" and previous is not None:
+                # It is this minibatch, whose values are computed anyway
+                values = joint_pass(self.q_net, replay_data, reference, None, self.double_q)
+                return values._replace(previous_reference=values.current)
             return joint_pass(self.q_net, replay_data, reference, previous, self.double_q)
         # Reference batches go through the network as it acts in the environment: they do not move the running statistics
         # of BatchNorm, and the noise of dropout is no churn

@@ -13,6 +13,7 @@ from sb3_cchain.replaced import replaced
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
 
+
 # Rollouts in SB3's buffers whose observations take at most this many bytes are gathered once per epoch, which holds them
 # twice. Larger ones are gathered minibatch by minibatch
 HELD_AT_MOST = 2**24
