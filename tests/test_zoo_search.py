@@ -69,12 +69,14 @@ def test_the_range_of_beta_depends_on_the_actions(algo, n_actions, low, high):
     assert np.ptp(np.log10(ratios)) > 1
 
 
-def test_reference_batches_are_searched_for_ppo():
+@pytest.mark.parametrize("algo, sizes", [("ppo_cchain", {0.25, 0.5, 1.0, 2.0, 4.0, 8.0}), ("dqn_cchain", {None})])
+def test_reference_batches_are_searched(algo, sizes):
     search.register_search_spaces()
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    sampled = [search.HYPERPARAMS_SAMPLER["ppo_cchain"](study.ask(), 0, 1, {}) for _ in range(40)]
+    sample = search.HYPERPARAMS_SAMPLER[algo]
+    sampled = [sample(study.ask(), 0, 1, {"using_her_replay_buffer": False}) for _ in range(40)]
     assert {each["churn_reference"] for each in sampled} == set(REFERENCES)
-    assert {each["churn_batch_size"] for each in sampled} == {0.25, 0.5, 1.0, 2.0, 4.0, 8.0}
+    assert {each.get("churn_batch_size") for each in sampled} == sizes
 
 
 def test_the_papers_grids():

@@ -69,8 +69,8 @@ def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sa
     """
     :param sampler: Search space of the algorithm without churn reduction
     :param algorithm: An algorithm with churn reduction
-    :return: The same search space, and β: a decade beyond the paper's values on either side. With PPO also where the reference
-        batches are taken from, and their size.
+    :return: The same search space, β, a decade beyond the paper's values on either side, and where the reference batches are
+        taken from. With PPO also their size.
     """
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -82,8 +82,8 @@ def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sa
         else:
             low, high = 1e2, 1e6  # around 1e3 to 1e5
         sampled["target_churn_ratio"] = trial.suggest_float("target_churn_ratio", low, high, log=True)
+        sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
         if issubclass(algorithm, OnPolicyAlgorithm):
-            sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
             sampled["churn_batch_size"] = trial.suggest_categorical("churn_batch_size", [0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
         return sampled
 
