@@ -219,5 +219,5 @@ def test_tables_of_the_parts():
     total = [sum(int(row[column]) for row in table.rows[:-1]) for column in range(1, 5)]
     assert total == pytest.approx([int(cell) for cell in table.rows[-1][1:]], abs=len(PARTS))
     table = dqn_parts(n_rounds=1, n_updates=2, buffer_size=100, learning_starts=10)
-    assert table.header == ["", "DoubleDQN", "CChainDQN"] and REFERENCE not in {row[0] for row in table.rows}
+    assert table.header[:3] == ["", "DoubleDQN", "CChainDQN"] and REFERENCE not in {row[0] for row in table.rows}
     assert all(int(cell) > 0 for row in table.rows for cell in row[1:])

@@ -114,9 +114,13 @@ def minatar(n_past_updates: int = 0) -> Case:
     """
     changed = {"buffer_size": 20_000, "learning_starts": 1000}
     settings = model_settings("double_dqn", "Continual/MinAtar-v0", **changed)
-    cchain = CChainDQN(**model_settings("dqn_cchain", "Continual/MinAtar-v0", **changed))
-    models: dict[str, Any] = {"DoubleDQN": DoubleDQN(**settings), "CChainDQN": cchain}
-    models["deep copy"] = DeepCopyDQN(**{name: value for name, value in settings.items() if name not in ("double_q", "loss")})
+    cchain = partial(model_settings, "dqn_cchain", "Continual/MinAtar-v0", **changed)
+    models: dict[str, Any] = {
+        "DoubleDQN": DoubleDQN(**settings),
+        "CChainDQN": CChainDQN(**cchain()),
+        'CChainDQN, `churn_reference="next"`': CChainDQN(**cchain(), churn_reference="next"),
+        "deep copy": DeepCopyDQN(**{name: value for name, value in settings.items() if name not in ("double_q", "loss")}),
+    }
     entries = {}
     for name, model in models.items():
         timed_learn(model, 1200, "")
@@ -124,7 +128,9 @@ def minatar(n_past_updates: int = 0) -> Case:
         round_of_it = partial(timed_learn, model, 200, "environment step and update")
         entries[name] = Entry(round_of_it, 200 * n_operations(one_update))
     for _ in range(n_past_updates):
-        models["CChainDQN"].churn_reducer.coefficient.update(0.01, 1e-6)
+        for model in models.values():
+            if isinstance(model, CChainDQN):
+                model.churn_reducer.coefficient.update(0.01, 1e-6)
         models["deep copy"].td_losses.append(0.01)
         models["deep copy"].churn_losses.append(1e-6)
     note = "Seconds are of 200 steps with an update each."

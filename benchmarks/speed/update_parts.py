@@ -123,9 +123,11 @@ def dqn_parts(n_rounds: int = 12, n_updates: int = 200, **changed: Any) -> Table
     :return: The parts of an update in MinAtar
     """
     changed = {"buffer_size": 20_000, "learning_starts": 1000, **changed}
+    stock, cchain = (model_settings(algo, "Continual/MinAtar-v0", **changed) for algo in ("double_dqn", "dqn_cchain"))
     models = {
-        "DoubleDQN": DoubleDQN(**model_settings("double_dqn", "Continual/MinAtar-v0", **changed)),
-        "CChainDQN": CChainDQN(**model_settings("dqn_cchain", "Continual/MinAtar-v0", **changed)),
+        "DoubleDQN": DoubleDQN(**stock),
+        "CChainDQN": CChainDQN(**cchain),
+        'CChainDQN, `churn_reference="next"`': CChainDQN(**cchain, churn_reference="next"),
     }
     for model in models.values():
         model.learn(model.learning_starts + 200)
