@@ -12,6 +12,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, package_versions
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
@@ -122,12 +123,20 @@ class TrainingCheckpoint(BaseCallback):
             self._check_resumed(self._resumed)
             self._seconds_before = self._resumed.seconds
         if self.exact:
-            for env in self._parts.envs.values():
-                prepare_environment(env)
+            for name, env in self._parts.envs.items():
+                self._prepare(name, env)
         in_same_folder = self._resumed is not None and self._resumed.folder.resolve() == self.path.resolve()
         newest = self._resumed.num_timesteps if self._resumed is not None and in_same_folder else None
         self._folder = CheckpointFolder(self.path, self.keep, newest)
         self._listen_to_signals()
+
+    def _prepare(self, name: str, env: VecEnv) -> None:
+        try:
+            prepare_environment(env)
+        except ValueError as error:
+            owner = self._parts.callbacks.get(name.rpartition(" ")[0])
+            where = "training environment" if owner is None else f"environment of {type(owner).__name__}"
+            raise ValueError(f"The {where} cannot be resumed exactly. {error}") from error
 
     def _check_resumed(self, checkpoint: Checkpoint) -> None:
         checkpoint.warn_of_other_versions()
