@@ -1,13 +1,15 @@
 """The state of vectorised environments, with all that is in them."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor, VecVideoRecorder
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from sb3_cchain.checkpoint.object_state import Attributes, object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.checkpoint.resumable_env import (
+    RESUMED,
     ResumableEnv,
     attempt,
     can_save_single_environment,
@@ -69,12 +71,16 @@ def environment_state(env: VecEnv) -> dict[str, Any]:
     :raises ValueError: When the state cannot be saved
     """
     layers, left_out = _vec_layers(env), list[str]()
-    states = object_states(layers, _known(layers), skip=dict.fromkeys(layers, NO_STATE), left_out=left_out)
-    for name, layer in layers.items():
-        if isinstance(layer, VecMonitor) and isinstance(states[name], Attributes):
-            # From which it counts in its file
-            states[name].values.pop("t_start", None)
-    return {"layers": states, "envs": _single_states(env.unwrapped), "n_envs": env.num_envs, "left_out": left_out}
+    # A monitor counts from its start in its file
+    skip = {name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()}
+    states = object_states(layers, _known(layers), skip=skip, left_out=left_out)
+    return {
+        "n_envs": env.num_envs,
+        "layers": states,
+        "envs": _single_states(env.unwrapped),
+        "reset_infos": deepcopy(list(env.unwrapped.reset_infos)),
+        "left_out": left_out,
+    }
 
 
 def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
@@ -87,7 +93,7 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     """
     if env.num_envs != state["n_envs"]:
         raise ValueError(
-            f"There must be {state['n_envs']} environments side by side, as when it was saved, got {env.num_envs}"
+            f"There must be {state['n_envs']} environments side by side, as in the checkpoint, got {env.num_envs}"
         )
     layers = _vec_layers(env)
     check_same_layers(layers, state["layers"])
@@ -98,6 +104,10 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
             remote.send(("env_method", ("attempt_load", (single,), {})))
         for position, (fault, _) in enumerate([remote.recv() for remote in base.remotes]):
             _raise(position, fault)
+        for remote, info in zip(base.remotes, state["reset_infos"], strict=True):
+            remote.send(("reset", (None, {RESUMED: info})))
+        for remote in base.remotes:
+            remote.recv()
     elif isinstance(base, DummyVecEnv):
         for position, single in enumerate(base.envs):
             _raise(position, attempt(restore_single_environment, single, state["envs"][position])[0])
@@ -141,8 +151,8 @@ def _check_outermost(env: SubprocVecEnv) -> None:
     if names and all(name == ResumableEnv.__name__ for name in names):
         return
     raise ValueError(
-        "The environments of SubprocVecEnv are in other processes and cannot be resumed unless ResumableEnv is their outermost "
-        "wrapper: make_vec_env(..., vec_env_cls=SubprocVecEnv, wrapper_class=ResumableEnv)"
+        "The environments of SubprocVecEnv are in other processes and cannot be resumed unless ResumableEnv is their "
+        "outermost wrapper: make_vec_env(..., vec_env_cls=SubprocVecEnv, wrapper_class=ResumableEnv)"
     )
 
 

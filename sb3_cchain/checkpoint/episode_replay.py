@@ -37,7 +37,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._observation: Any = None
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """That of the environment, as this wrapper changes nothing."""
         return self.env.spec
 
@@ -102,13 +102,14 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         same = _same(self._observation, state["observation"]) and _generator_state(self.unwrapped) == state["generator"]
         if not same:
             raise ValueError(
-                f"{self.env} cannot be resumed exactly: played again, an episode of {len(self._actions)} steps ends otherwise. "
-                "The environment is not deterministic, or it was made with other arguments. Give its class `state_dict()` and "
-                "`load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
+                f"{self.env} cannot be resumed exactly: an episode of {len(self._actions)} steps went otherwise when it was "
+                "played again. The environment is not deterministic, or it was made with other arguments. Give its class "
+                "`state_dict()` and `load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
             )
 
     def _attributes(self) -> dict[str, Any]:
-        return object_states(self._layers(), self._known(), skip=dict.fromkeys(self._layers(), CONSTRUCTION))
+        layers = self._layers()
+        return object_states(layers, self._known(), skip=dict.fromkeys(layers, CONSTRUCTION))
 
     def _layers(self) -> dict[str, gym.Env]:
         layers, env = [self.env], self.env

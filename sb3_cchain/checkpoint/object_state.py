@@ -10,6 +10,7 @@ modules and optimisers have. Its attributes are not looked at then.
 
 import importlib
 import io
+import math
 import pickle
 import random
 from collections.abc import Callable, Collection, Mapping
@@ -23,12 +24,16 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import EzPickle
 from stable_baselines3.common.monitor import ResultsWriter
 
 # They belong to the process: code, files and their places, and how something was made
 KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, property, io.IOBase, PurePath, EnvSpec, ResultsWriter)
 # They are copied as a whole
 DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
+
+# They may consist of numbers and strings
+PLAIN = (Number, str, bytes, list, tuple, set, frozenset, dict)
 
 # Packages of windows and pictures, which belong to the process, too
 DISPLAYS = frozenset({"pygame", "glfw", "OpenGL", "matplotlib"})
@@ -86,10 +91,12 @@ class Data(NamedTuple):
 
     :param number: By which :class:`Same` refers to it
     :param content: Pickled
+    :param parts: Pickled random generators that it contains, such as those of the players in a list, by their numbers
     """
 
     number: int
     content: bytes
+    parts: dict[int, bytes]
 
 
 class Attributes(NamedTuple):
@@ -241,8 +248,7 @@ class _Reader:
         try:
             if not self._strict and not _is_data(value):
                 raise NotSaved("an object of another package")
-            content = self._pickled(value)
-            return Data(self._number(value), content)
+            return self._data(value)
         except Exception as error:  # whatever the object's own code raises
             if self._strict:
                 raise NotSaved(f"{path}: {error}") from error
@@ -253,6 +259,26 @@ class _Reader:
         if isinstance(value, spaces.Space):
             return True
         return not _is_data(value) and (self._strict or _package(type(value)) in self._packages)
+
+    def _data(self, value: Any) -> Data:
+        if value is None or isinstance(value, PLAIN):
+            plain = pickle.dumps(value, protocol=5)
+            if pickle.STACK_GLOBAL not in plain:
+                # Numbers and strings only. To look at each of them for known objects takes ten times as long
+                return Data(self._number(value), plain, {})
+        file, parts = io.BytesIO(), dict[int, bytes]()
+
+        def refer(part: Any) -> int | None:
+            if part is value:
+                return None
+            # One generator stays one, whether it is met here, in another container or in an attribute
+            if id(part) not in self._numbers:
+                content = self._pickled(part)
+                parts[self._number(part)] = content
+            return self._numbers[id(part)]
+
+        _DataPickler(file, self._known, refer).dump(value)
+        return Data(self._number(value), file.getvalue(), parts)
 
     def _number(self, value: Any) -> int:
         self._met.append(value)
@@ -275,10 +301,9 @@ class _Writer:
     def _fill(self, holder: object, state: Attributes) -> None:
         for name, value in state.values.items():
             old = vars(holder).get(name)
-            if _is_kept(old):
-                continue
             new = self._value(old, value)
-            if new is not old:
+            # The value is needed even if this process keeps its own: others may be the same one
+            if new is not old and not _is_kept(old):
                 vars(holder)[name] = new
 
     def _value(self, old: Any, state: Any) -> Any:
@@ -299,6 +324,8 @@ class _Writer:
             if own is not None:  # not an object that this process does without, such as a file
                 own.restore(old, self._unpickled(state.content))
             return old
+        for number, content in state.parts.items():
+            self._values[number] = self._unpickled(content)
         new = self._unpickled(state.content)
         if type(old) is type(new) and type(new) in _COPY_INTO:
             _COPY_INTO[type(new)](old, new)
@@ -307,7 +334,7 @@ class _Writer:
         return new
 
     def _unpickled(self, content: bytes) -> Any:
-        return KnownUnpickler(io.BytesIO(content), self._known).load()
+        return _DataUnpickler(io.BytesIO(content), self._known, self._values).load()
 
 
 class KnownPickler(pickle.Pickler):
@@ -329,6 +356,10 @@ class KnownPickler(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         """See ``pickle.Pickler``."""
+        if type(value) is np.ndarray and _is_transposed(value):
+            # Pickle would lay it out otherwise, and convolutions round otherwise then
+            order = sorted(range(value.ndim), key=lambda axis: (-abs(value.strides[axis]), value.shape[axis] == 1))
+            return np.transpose, (np.array(value.transpose(order), order="C"), np.argsort(order).tolist())
         if not isinstance(value, th.Tensor):
             return NotImplemented
         if not value.is_leaf:
@@ -354,6 +385,38 @@ class KnownUnpickler(pickle.Unpickler):
     def persistent_load(self, name: str) -> object:
         """See ``pickle.Unpickler``."""
         return self._known[name]
+
+
+class _DataPickler(KnownPickler):
+    def __init__(self, file: Any, known: Mapping[int, str], refer: Callable[[Any], int | None]):
+        super().__init__(file, known)
+        self._refer = refer
+
+    def persistent_id(self, value: Any) -> Any:
+        # Called for every number in it
+        name = self._known.get(id(value))
+        return self._refer(value) if name is None and type(value) in _COPY_INTO else name
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, EzPickle):
+            # Gymnasium pickles how they were made, not their state
+            raise NotSaved(f"it contains {value}, whose state pickle does not save")
+        return super().reducer_override(value)
+
+
+class _DataUnpickler(KnownUnpickler):
+    def __init__(self, file: Any, known: Mapping[str, object], values: Mapping[int, object]):
+        super().__init__(file, known)
+        self._values = values
+
+    def persistent_load(self, name: Any) -> object:
+        return self._values[name] if isinstance(name, int) else super().persistent_load(name)
+
+
+def _is_transposed(array: np.ndarray) -> bool:
+    """Whether axes have another order in memory, as those of transposed images. An axis of length 1 has a place there, too."""
+    compact = [array.itemsize * math.prod(array.shape[axis + 1 :]) for axis in range(array.ndim)]
+    return array.size > 0 and list(array.strides) != compact and not array.flags.fnc
 
 
 def _is_data(value: object) -> bool:

@@ -1,17 +1,21 @@
 """The state of a single environment with its wrappers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.mujoco_state import register_mujoco
-from sb3_cchain.checkpoint.object_state import Attributes, NotSaved, object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import NotSaved, object_states, restore_objects
+from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.envs.continual_env import ContinualEnv
+
+# As an option of `reset()`, the info of the reset with which the present episode began. See `ResumableEnv.reset`
+RESUMED = "sb3_cchain.resumed_reset_info"
 
 
 class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
@@ -30,9 +34,20 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._fault = attempt(make_resumable, self, begun=False)[0]
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """That of the environment, as this wrapper changes nothing."""
         return self.env.spec
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ObsType, dict[str, Any]]:
+        """
+        :param seed: Passed on
+        :param options: Passed on. ``SubprocVecEnv`` keeps the info of the last reset in the other process, where only a reset
+            can put it back. So with :data:`RESUMED` among the options the episode goes on, and there is no observation
+        :return: Observation and info
+        """
+        if options is not None and RESUMED in options:
+            return None, options[RESUMED]  # type: ignore[return-value]
+        return self.env.reset(seed=seed, options=options)
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -103,9 +118,14 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
     :return: It, or a wrapper if that has to be around all
     :raises ValueError: When the environment cannot be made resumable
     """
-    register_mujoco()
+    register_simulators()
     chain = _chain(env)
     base = chain[-1]
+    if is_inexact(base):
+        raise ValueError(
+            f"{base} cannot be resumed exactly, because its simulator saves only a part of its state. Begin new episodes when "
+            "training is resumed (TrainingCheckpoint(..., exact=False))"
+        )
     if isinstance(base, ContinualEnv):
         for task_id, task in enumerate(base.tasks):
             base.tasks[task_id] = make_resumable(task, begun=begun and task_id in base._seeded)
@@ -118,7 +138,7 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
                 f"{layer} cannot be resumed, because its state cannot be saved: {fault}. "
                 "Give its class `state_dict()` and `load_state_dict(state)`"
             )
-        replay: gym.Env = EpisodeReplay(layer, begun=begun)
+        replay: gym.Env = EpisodeReplay(layer, begun=begun and _may_have_begun(chain))
         if position == 0:
             return replay
         outer = chain[position - 1]
@@ -126,6 +146,11 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
         outer.env = replay
         break
     return env
+
+
+def _may_have_begun(chain: Sequence[gym.Env]) -> bool:
+    # Gymnasium's wrapper knows of resets; an environment for evaluation may not have been used yet
+    return all(layer.has_reset for layer in chain if isinstance(layer, OrderEnforcing))
 
 
 def can_save_single_environment(env: gym.Env) -> bool:
@@ -142,10 +167,11 @@ def single_environment_state(env: gym.Env) -> dict[str, Any]:
     :return: Its state and that of its wrappers, by their names; it can be pickled and does not change any more
     :raises ValueError: When the state cannot be saved
     """
-    register_mujoco()
+    register_simulators()
     layers = _layers(env)
-    states = object_states(layers, _known(layers), skip=dict.fromkeys(layers, CONSTRUCTION), strict=True)
-    return {name: without_start_time(layers[name], state) for name, state in states.items()}
+    skip = {name: (*CONSTRUCTION, *_times(layer)) for name, layer in layers.items()}
+    with emptied(_tasks_not_under_way(layers)):
+        return object_states(layers, _known(layers), skip=skip, strict=True)
 
 
 def restore_single_environment(env: gym.Env, state: dict[str, Any]) -> None:
@@ -156,21 +182,10 @@ def restore_single_environment(env: gym.Env, state: dict[str, Any]) -> None:
     :param state: What :func:`single_environment_state` returned
     :raises ValueError: When the environment has other wrappers
     """
-    register_mujoco()
+    register_simulators()
     layers = _layers(env)
     check_same_layers(layers, state)
     restore_objects(layers, state, _known(layers))
-
-
-def without_start_time(layer: object, state: Any) -> Any:
-    """
-    :param layer: A wrapper
-    :param state: Its state
-    :return: The state without the time at which a monitor was made, from which it counts in its file
-    """
-    if isinstance(state, Attributes) and isinstance(layer, Monitor):
-        state.values.pop("t_start", None)
-    return state
 
 
 def check_same_layers(layers: Mapping[str, object], state: Mapping[str, Any]) -> None:
@@ -222,6 +237,17 @@ def _known(layers: Mapping[str, gym.Env]) -> dict[str, object]:
     return known
 
 
+def _tasks_not_under_way(layers: Mapping[str, gym.Env]) -> list[gym.Env]:
+    """Tasks of continual environments that do nothing before their next reset."""
+    continual = [layer for layer in layers.values() if isinstance(layer, ContinualEnv)]
+    return [task for env in continual for task in env.tasks if task is not env.task]
+
+
+def _times(layer: gym.Env) -> tuple[str, ...]:
+    # A monitor counts from then in its file
+    return ("t_start",) if isinstance(layer, Monitor) else ()
+
+
 def _fault(env: gym.Env, layer: gym.Env) -> str | None:
     """Why the state of a layer cannot be saved, if it cannot."""
     layers = _layers(env)
@@ -230,7 +256,9 @@ def _fault(env: gym.Env, layer: gym.Env) -> str | None:
         return None
     others = {other: known for other, known in layers.items() if other != name}
     try:
-        object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=True)
+        # What MuJoCo's data are is known
+        with emptied(layers.values()):
+            object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=True)
     except NotSaved as error:
         return str(error)
     return None

@@ -1,9 +1,12 @@
-"""The state of MuJoCo's simulations, of Gymnasium's environments and of dm_control's."""
+"""The state of simulations whose code is not Python: MuJoCo's, in Gymnasium and dm_control."""
 
 import sys
 import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from sb3_cchain.checkpoint.object_state import register_state
@@ -13,10 +16,12 @@ from sb3_cchain.checkpoint.object_state import register_state
 SHAPES = ("tex_data", "mesh_", "skin_", "flex_", "bvh_", "oct_", "names", "paths", "text_", "plugin_attr")
 
 
-def register_mujoco() -> None:
-    """Teach :mod:`~sb3_cchain.checkpoint.object_state` MuJoCo's objects, if there are any in this process."""
+def register_simulators() -> None:
+    """
+    Teach :mod:`~sb3_cchain.checkpoint.object_state` the objects of simulators, as far as these are imported in this process.
+    """
     mujoco = sys.modules.get("mujoco")
-    if mujoco is not None and hasattr(mujoco, "MjData"):
+    if mujoco is not None:
         register_state(mujoco.MjModel, _model_state, _restore_model)
         register_state(mujoco.MjData, _data_state, _restore_data)
     engine = sys.modules.get("dm_control.mujoco.engine")
@@ -24,12 +29,44 @@ def register_mujoco() -> None:
         register_state(engine.Physics, _physics_state, _restore_physics)
 
 
+def is_inexact(env: gym.Env) -> bool:
+    """
+    :param env: An environment without wrappers
+    :return: Whether its simulator has no exact state. That of Atari saves the random numbers of sticky actions, but not all of
+        the picture: after a restart, sprites may be missing in the first frame. Nor does a reset always begin alike
+    """
+    atari = sys.modules.get("ale_py")
+    return atari is not None and isinstance(vars(env).get("ale"), atari.ALEInterface)
+
+
+# Ids of data that the next reset empties before they are used
+_emptied: set[int] = set()
+
+
+@contextmanager
+def emptied(envs: Iterable[gym.Env]) -> Iterator[None]:
+    """
+    Leave out MuJoCo's data of environments within the context. To save them takes most of a second in the largest models.
+
+    :param envs: Environments that are reset before the next step. A reset leaves nothing of the data
+    """
+    _emptied.update(id(data) for env in envs if (data := _find_data(env.unwrapped)) is not None)
+    try:
+        yield
+    finally:
+        _emptied.clear()
+
+
+def _find_data(env: gym.Env) -> Any:
+    attributes = vars(env)
+    physics = getattr(attributes.get("_env"), "physics", None)
+    return attributes.get("data") if physics is None else physics.data.ptr
+
+
 def _model_state(model: Any) -> dict[str, Any]:
     arrays = _arrays(model)
-    shapes = {name: zlib.crc32(arrays.pop(name)) for name in list(arrays) if name.startswith(SHAPES)}
-    options = {
-        part: {name: np.array(value) for name, value in _values(getattr(model, part)).items()} for part in ("opt", "stat")
-    }
+    shapes = {name: zlib.crc32(arrays.pop(name).tobytes()) for name in list(arrays) if name.startswith(SHAPES)}
+    options = {part: _values(getattr(model, part)) for part in ("opt", "stat")}
     content = {name: zlib.compress(array.tobytes(), 1) for name, array in arrays.items()}
     return {"arrays": content, "options": options, "shapes": shapes}
 
@@ -37,7 +74,7 @@ def _model_state(model: Any) -> dict[str, Any]:
 def _restore_model(model: Any, state: dict[str, Any]) -> None:
     arrays = _arrays(model)
     for name, checksum in state["shapes"].items():
-        if name not in arrays or zlib.crc32(arrays[name]) != checksum:
+        if name not in arrays or zlib.crc32(arrays[name].tobytes()) != checksum:
             raise ValueError(f"The MuJoCo model differs from the saved one in `{name}`: make the same environment")
     for name, content in state["arrays"].items():
         saved = np.frombuffer(zlib.decompress(content), dtype=arrays[name].dtype)
@@ -64,27 +101,42 @@ def _arrays(model: Any) -> dict[str, np.ndarray]:
 
 def _values(part: Any) -> dict[str, Any]:
     found = {name: getattr(part, name) for name in dir(part) if not name.startswith("_")}
-    return {name: value for name, value in found.items() if isinstance(value, int | float | np.ndarray)}
+    return {name: np.array(value) for name, value in found.items() if isinstance(value, int | float | np.ndarray)}
 
 
-def _data_state(data: Any) -> dict[str, Any]:
-    # MuJoCo writes everything: positions and velocities, what follows from them, contacts and forces. It writes the model
-    # first, which is hundreds of times as large
-    content, model = data.__getstate__(), data.model.__getstate__()
-    if content[1 : 1 + len(model)] == model:
-        return {"head": content[:1], "tail": zlib.compress(content[1 + len(model) :], 1)}
+def _data_state(data: Any) -> dict[str, Any] | None:
+    if id(data) in _emptied:
+        return None
+    # MuJoCo writes everything: positions and velocities, what follows from them, contacts and forces
+    content, size = data.__getstate__(), _size(data.model)
+    if content[1:].startswith(_begin(size)):
+        # The model comes first, and is up to a hundred times as large
+        return {"head": content[:1], "tail": zlib.compress(memoryview(content)[1 + size :], 1)}
     return {"head": content, "tail": None}
 
 
-def _restore_data(data: Any, state: dict[str, Any]) -> None:
+def _restore_data(data: Any, state: dict[str, Any] | None) -> None:
     import mujoco
 
+    if state is None:
+        return
     content = state["head"]
     if state["tail"] is not None:
-        content += data.model.__getstate__() + zlib.decompress(state["tail"])
+        content = b"".join([content, data.model.__getstate__(), zlib.decompress(state["tail"])])
     saved = mujoco.MjData.__new__(mujoco.MjData)
     saved.__setstate__(content)
     mujoco.mj_copyData(data, data.model, saved)
+
+
+def _size(model: Any) -> int:
+    """Bytes of a model as MuJoCo writes it: a flag, the size twice, and the model."""
+    import mujoco
+
+    return 1 + 8 + 8 + mujoco.mj_sizeModel(model)
+
+
+def _begin(size: int) -> bytes:
+    return b"\x01" + 2 * (size - 17).to_bytes(8, "little")
 
 
 def _physics_state(physics: Any) -> dict[str, Any]:
