@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -149,6 +150,8 @@ class TrainingCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self._resumed is not None:
             checkpoint, self._resumed = self._resumed, None
+            if not checkpoint.info["training_checkpoint"]["exact"]:
+                warnings.warn("All environments begin new episodes, so that training goes on, but not exactly (exact=False).")
             restore_training(self._parts, checkpoint.read_state(), checkpoint.model_path, checkpoint.store)
         elif self._stop_signal is not None:
             self._stop()
