@@ -33,24 +33,25 @@ def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) 
         yield
 
 
-def carrying(tensor: th.Tensor, loss: th.Tensor) -> th.Tensor:
+def carrying(tensor: th.Tensor, loss: th.Tensor, coef: float = 1.0) -> th.Tensor:
     """
     Let a tensor that the loop's loss is computed from carry a further loss: the loop's own ``backward()`` then adds its
     gradient, too.
 
     :param tensor: What the loop's loss depends on
     :param loss: A scalar
+    :param coef: What its gradient is multiplied by
     :return: The tensor, with the same values
     """
-    return _Carrying.apply(tensor, loss)
+    return _Carrying.apply(tensor, loss, coef)
 
 
 class _Carrying(th.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, tensor: th.Tensor, loss: th.Tensor) -> th.Tensor:
-        ctx.loss_options = dict(dtype=loss.dtype, device=loss.device)
+    def forward(ctx: Any, tensor: th.Tensor, loss: th.Tensor, coef: float) -> th.Tensor:
+        ctx.coef = loss.new_tensor(coef)
         return tensor.view_as(tensor)
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return gradient, th.ones((), **ctx.loss_options)
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor, None]:
+        return gradient, ctx.coef, None

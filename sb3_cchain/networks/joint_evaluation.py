@@ -56,14 +56,19 @@ def evaluate_jointly(
     :param further: Observations that go through the actor only; None, or an empty batch, for none
     :return: The evaluation of the minibatch, and the actor's outputs on both
     """
-    policy, n = networks.policy, n_observations(observations)
+    policy = networks.policy
     together = observations
     if further is not None and n_observations(further) > 0:
         together = joined(observations, further)
+
+    def own(tensor: th.Tensor) -> th.Tensor:
+        # Of the minibatch. A slice that is everything would cost a copy in the backward pass
+        return tensor if together is observations else tensor[: n_observations(observations)]
+
     features = networks.actor_features(together)
     latent = networks.latent(features)
     outputs = networks.outputs(latent)
-    distribution = distribution_of(policy, latent[:n], outputs[:n])
+    distribution = distribution_of(policy, own(latent), own(outputs))
     shared = policy.share_features_extractor
-    values = networks.values(features[:n] if shared else networks.critic_features(observations))
+    values = networks.values(own(features) if shared else networks.critic_features(observations))
     return Evaluation(values, distribution.log_prob(actions), distribution.entropy(), outputs)
