@@ -3,6 +3,7 @@ C-CHAIN with other reference batches (``churn_reference``, ``churn_batch_size``)
 trains, and writes a table and learning curves for each environment. The same command goes on where it was interrupted.
 
     python -m benchmarks.references --n-tasks 4 --steps-per-task 64000 --seeds 0 1 2 3
+    python -m benchmarks.references --suite minatar --variants independent next --n-tasks 1 --steps-per-task 20000
 """
 
 import argparse
@@ -13,13 +14,13 @@ from benchmarks.grid.arguments import add_variant_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import Run, make_run, suite_methods
-from benchmarks.grid.suites import SUITES
 from benchmarks.report.figures import plot_learning_curves
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.task_tables import cost_table, mean_rows, returns_header, returns_rows
 
-SUITE = "gym_control"
-CCHAIN = suite_methods(SUITE)["cchain"]
+# The suites whose algorithms have the argument, and the environments that are trained in by default
+ENVIRONMENTS = {"gym_control": ["Continual/Acrobot-v1", "Continual/LunarLander-v3"], "minatar": ["Continual/MinAtar-v0"]}
+CCHAIN = suite_methods("gym_control")["cchain"]
 
 # What is compared: label and colour of each, and how it differs from the shipped hyperparameters
 LINES = {
@@ -30,16 +31,17 @@ LINES = {
 OVERRIDES = {"independent": (), "next": ("churn_reference:'next'",), "half": ("churn_batch_size:0.5",)}
 
 
-def variant_run(name: str, env_id: str, seed: int, n_tasks: int, steps: int) -> Run:
+def variant_run(suite: str, name: str, env_id: str, seed: int, n_tasks: int, steps: int) -> Run:
     """
-    :param name: One of ``LINES``
+    :param suite: One of ``ENVIRONMENTS``
+    :param name: One of ``LINES``; DQN has no other sizes
     :param env_id: Environment id
     :param seed: Seed
     :param n_tasks: Length of the task sequence
     :param steps: Environment steps per task
     :return: The run
     """
-    run = make_run(SUITE, env_id, CCHAIN.name, seed, n_tasks, steps, f"references_{n_tasks}x{steps}")
+    run = make_run(suite, env_id, CCHAIN.name, seed, n_tasks, steps, f"references_{n_tasks}x{steps}")
     return replace(run, variant=name, overrides=OVERRIDES[name])
 
 
@@ -60,22 +62,23 @@ def write_report(results: Sequence[Result]) -> None:
 def main() -> None:
     """Parse the command line, train, write and print the tables and the curves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    environments = ["Continual/Acrobot-v1", "Continual/LunarLander-v3"]
-    parser.add_argument("--env", nargs="+", default=environments, choices=SUITES[SUITE].env_ids, help="Environment ids")
+    parser.add_argument("--suite", default="gym_control", choices=list(ENVIRONMENTS), help="Suite of the environments")
+    parser.add_argument("--env", nargs="+", help="Environment ids")
     add_variant_arguments(parser, LINES, seeds=[0, 1, 2, 3], n_tasks=4, steps_per_task=64_000)
     args = parser.parse_args()
+    env_ids = args.env or ENVIRONMENTS[args.suite]
 
     try:
         runs = [
-            variant_run(name, env_id, seed, args.n_tasks, args.steps_per_task)
+            variant_run(args.suite, name, env_id, seed, args.n_tasks, args.steps_per_task)
             for seed in args.seeds
-            for env_id in args.env
+            for env_id in env_ids
             for name in args.variants
         ]
     except ValueError as error:
         parser.error(str(error))
     results = train_all(runs, args.output, args.jobs)
-    for env_id in args.env:
+    for env_id in env_ids:
         write_report([result for result in results if result.env_id == env_id])
 
 

@@ -97,7 +97,8 @@ def test_references(run_command, tmp_path, capsys):
 
 
 def test_what_the_references_differ_in():
-    overrides = {name: references.variant_run(name, "Continual/Acrobot-v1", 0, 2, 800).overrides for name in references.LINES}
+    runs = {name: references.variant_run("gym_control", name, "Continual/Acrobot-v1", 0, 2, 800) for name in references.LINES}
+    overrides = {name: run.overrides for name, run in runs.items()}
     assert overrides == {"independent": (), "next": ("churn_reference:'next'",), "half": ("churn_batch_size:0.5",)}
 
 
