@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,16 +18,18 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from benchmarks.grid.attempts import Attempt, new_attempt
 from benchmarks.grid.executor import RETRIES, LocalBackend, complete, gpu_places
 from benchmarks.grid.plan import Rates, grid_runs, run_length
 from benchmarks.grid.ray_backend import RayBackend, count_slots
 from benchmarks.grid.results import RENAMED, Result, find_result, read_result, read_results, write_result
-from benchmarks.grid.run import ROOT, Run, as_json, make_run, paper_methods, suite_methods
+from benchmarks.grid.run import ROOT, Run, as_json, make_run, other_beta, paper_methods, split_line, suite_methods
 from benchmarks.grid.suites import SUITES, task_names
+from benchmarks.grid.training import metrics_rows
 from benchmarks.grid.view import Failure, View, duration
 from benchmarks.run import main
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
-from tests.fake_training import fake_program
+from tests.fake_training import fake_program, save_checkpoint
 
 RUN = Run("gym_control", "Continual/CartPole-v1", "cchain", 0, 2, 800, "smoke")
 ROWS = [
@@ -201,6 +204,32 @@ def test_the_grid_of_gym_control():
     assert len(grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
 
 
+def test_another_beta_is_a_line_of_its_own(tmp_path):
+    cartpole = ["Continual/CartPole-v1"]
+    grid = grid_runs(["gym_control"], cartpole, ["cchain@1000", "vanilla", "cchain@0.05", "cchain@1e3", "cchain"], 2)
+    assert [(run.seed, run.line, run.method) for run in grid] == [
+        (seed, *line)
+        for seed in (0, 1)
+        for line in (("cchain@1e3", "cchain"), ("vanilla", "vanilla"), ("cchain@0.05", "cchain"), ("cchain", "cchain"))
+    ]
+    run, plain = grid[0], grid[3]
+    assert run.overrides == ("target_churn_ratio:1e3",) and run.arguments(Path("logs"))[-1] == run.overrides[0]
+    assert (other_beta(run), other_beta(plain)) == ({"target_churn_ratio": 1000.0}, {})
+    assert run.path_in(tmp_path).parts[-2:] == ("cchain@1e3", "seed_0") and run.name == "CartPole-v1 cchain@1e3 seed 0"
+    # It takes as long as the shipped one
+    result = make_result(tmp_path, replace(plain, n_tasks=1, steps_per_task=100), seconds=50.0)
+    assert Rates([result]).seconds(replace(run, n_tasks=1, steps_per_task=200)) == 100.0
+    write_result(make_result(tmp_path, run), ROWS, [])
+    assert find_result(run, tmp_path).line == "cchain@1e3" and find_result(plain, tmp_path) is None
+    evaluated = make_run("minatar", "Continual/MinAtar-v0", "cchain@0.1", 0, 3, 3000, "smoke")
+    assert (evaluated.eval_freq, evaluated.line, evaluated.algo) == (100, "cchain@0.1", "dqn_cchain")
+
+
+@pytest.mark.parametrize("number, text", [(1e3, "1e3"), (100, "100"), (0.05, "0.05"), (12345, "12345"), (1 / 3, repr(1 / 3))])
+def test_each_beta_has_one_name(number, text):
+    assert split_line(f"cchain@{number!r}") == ("cchain", text) and float(text) == number
+
+
 def test_lengths():
     assert run_length("gym_control", "Continual/Acrobot-v1", "reduced") == (4, 64_000)
     assert run_length("gym_control", "Continual/MountainCar-v0", "reduced") == (2, 128_000)
@@ -291,6 +320,9 @@ def test_runs_that_cannot_be_are_refused(changes, message):
             "--env must be one of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0",
         ),
         (["--method", "redo"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
+        (["--method", "cchain@x"], "`method` must have β after @, a number greater than 0, as in cchain@1e3; got cchain@x"),
+        (["--method", "cchain@-1"], "a number greater than 0, .*; got cchain@-1"),
+        (["--method", "trac@1e3"], "`method` can have a β after @ for cchain only; got trac@1e3"),
         (["--seeds", "0"], "--seeds must be at least 1; got 0"),
         (["--gpus-per-run", "-1"], "--gpus-per-run must be from 0.0001 to 1, or a whole number; got -1"),
         (["--gpus-per-run", "1.5"], "--gpus-per-run must be .*; got 1.5"),
@@ -516,6 +548,9 @@ def wait_for(condition, what, seconds=300):  # Ray gives its workers the lowest 
     return value
 
 
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
 # --- Execution, by both backends: the training command is another, which starts at once ----------------------------------
 
 
@@ -598,6 +633,116 @@ def test_the_progress_of_local_runs_is_shown(tmp_path):
     assert shown == ["50%, task 0, return -10"]
 
 
+@linux
+def test_a_run_goes_on_from_the_newest_checkpoint(tmp_path, backend, monkeypatch):
+    """The first seed is killed after a checkpoint; the second cannot go on from its checkpoint, and starts anew."""
+    results, logs = tmp_path / "results", tmp_path / "logs"
+    runs = [RUN, replace(RUN, seed=1)]
+    program = fake_program(tmp_path / "fake", {0: ["save", "ok"], 1: ["save", "fail", "ok"]})
+    monkeypatch.setattr(backend, "program", program)
+    assert complete(runs, results, logs, backend, silent()) == []
+    commands = []
+    for run in runs:
+        folders = sorted(run.path_in(logs).glob("attempt_*"))
+        resumed = [(folder / "log.txt").read_text().splitlines()[0].partition(" --resume ")[2] for folder in folders]
+        commands.append([folders.index(Path(path).parents[3]) if path else None for path in resumed])
+        assert all(path.endswith("/algo/env_1/checkpoints/step_000000000800") for path in resumed if path)
+        # None is left
+        assert not list(run.path_in(logs).rglob("checkpoint.json"))
+    assert commands == [[None, 0], [None, 0, None]]
+    first, second = (find_result(run, results) for run in runs)
+    # Of the training up to the checkpoint, and after it
+    assert first.seconds > 100 > second.seconds
+    attempt = Attempt(max(runs[0].path_in(logs).glob("attempt_*")))
+    assert [len(attempt.chain()), first.started, first.git_commit] == [2, attempt.chain()[0].started, attempt.git_commit]
+
+
+def test_a_checkpoint_of_other_settings_is_not_taken(tmp_path):
+    attempt, checkpoint = new_attempt(RUN, tmp_path, None)
+    assert checkpoint is None and attempt.origin is None
+    save_checkpoint(attempt.folder, 400)
+    save_checkpoint(attempt.folder, 800)
+    newest = attempt.folder / "algo" / "env_1" / "checkpoints" / "step_000000000800"
+    following, checkpoint = new_attempt(RUN, tmp_path, None)
+    assert checkpoint == newest and following.origin[0] == attempt.folder.name and following.origin[2:] == (800, 100.0)
+    # Of the same folder, and longer
+    assert new_attempt(replace(RUN, steps_per_task=801), tmp_path, None)[1] is None
+    # Without what an attempt before has logged, the result would not be whole
+    save_checkpoint(following.folder, 1200)
+    assert new_attempt(RUN, tmp_path, None)[1].parents[3] == following.folder
+    attempt.folder.rename(tmp_path / "elsewhere")
+    assert new_attempt(RUN, tmp_path, None)[1] is None
+    (tmp_path / "elsewhere").rename(attempt.folder)
+    shutil.rmtree(following.folder)
+    # A damaged one is passed over
+    (newest / "checkpoint.json").write_text("{")
+    assert new_attempt(RUN, tmp_path, None)[1] == newest.with_name("step_000000000400")
+
+
+def test_metrics_of_a_chain_by_hand(tmp_path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    def log(attempt, values):
+        writer = SummaryWriter(attempt.folder / "tensorboard" / "env" / "algo_1")
+        for step, value in values.items():
+            writer.add_scalar("churn/coef", value, step)
+            writer.add_scalar("train/loss", value, step)
+        writer.close()
+
+    first, _ = new_attempt(RUN, tmp_path, None)
+    log(first, {10: 1.0, 20: 2.0, 30: 99.0})
+    save_checkpoint(first.folder, 20)
+    second, _ = new_attempt(RUN, tmp_path, None)
+    # It is killed before it has saved anything, and the third goes on from the checkpoint of the first
+    log(second, {30: 98.0})
+    third, _ = new_attempt(RUN, tmp_path, None)
+    log(third, {20: 5.0, 30: 3.0, 40: 1 / 3})
+    rows = [(row["timesteps"], row["name"], row["value"]) for row in metrics_rows(third.chain())]
+    assert rows == [(step, "churn/coef", value) for step, value in ((10, "1"), (20, "5"), (30, "3"), (40, "0.333333"))]
+
+
+@linux
+def test_a_killed_and_a_stopped_training_end_as_one_that_was_not(tmp_path, monkeypatch):
+    """The real command. The first attempt is killed, the second is told to stop and saves, the third comes to the end."""
+    overrides = ("n_steps:64", "batch_size:32", "n_epochs:2", "policy_kwargs:dict(net_arch=[8])")
+    run = Run("gym_control", "Continual/Acrobot-v1", "cchain", 0, 2, 1600, "smoke", overrides=overrides)
+    monkeypatch.setitem(SUITES, "gym_control", replace(SUITES["gym_control"], checkpoint_freq=640))
+    (result,), _ = train([run], tmp_path / "uninterrupted")
+
+    logs = tmp_path / "logs"
+
+    def steps_saved(number):
+        folders = sorted(run.path_in(logs).glob("attempt_*"))[number:]
+        return [int(path.name[5:]) for folder in folders for path in folder.glob("*/*/checkpoints/step_*")]
+
+    with LocalBackend(1) as backend:
+        backend.start(run, logs)
+        wait_for(lambda: steps_saved(0), "checkpoint")
+        ((training, _),) = backend._running.values()
+        training.kill()
+        assert not training.is_running()
+    monkeypatch.setitem(SUITES, "gym_control", replace(SUITES["gym_control"], checkpoint_freq=10**6))
+    with LocalBackend(1) as backend:
+        backend.start(run, logs)
+        origin = next(iter(backend._running.values()))[0].attempt.origin.num_timesteps
+        share = wait_for(lambda: re.match(r"(\d+)%.*, from (\d+)%", "".join(backend.progress().values())), "progress")
+        assert int(share[2]) == round(100 * origin / run.total_steps)
+        wait_for(lambda: int("".join(backend.progress().values()).partition("%")[0] or 0) > int(share[2]), "further training")
+    (stopped,) = steps_saved(1)
+    assert stopped > origin
+    with LocalBackend(1) as backend:
+        assert complete([run], tmp_path / "results", logs, backend, silent(), retries=0) == []
+    resumed = find_result(run, tmp_path / "results")
+    for name in ("returns.csv", "metrics.csv"):
+        assert (resumed.path / name).read_bytes() == (result.path / name).read_bytes()
+    assert [
+        attempt.origin and attempt.origin.num_timesteps
+        for attempt in Attempt(max(run.path_in(logs).glob("attempt_*"))).chain()
+    ] == [None, origin, stopped]
+    assert len(resumed.metrics["churn/coef"]) == run.total_steps // 64 - 1
+    assert not list(logs.rglob("checkpoints"))
+
+
 def test_a_run_that_cannot_be_started_has_failed(tmp_path):
     (tmp_path / "file").touch()
     with LocalBackend(1) as backend:
@@ -622,17 +767,16 @@ def parent_process(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
 
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-
 DRIVER = """
 import sys
 from pathlib import Path
-from benchmarks.grid.executor import LocalBackend, complete
+from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
 from benchmarks.grid.ray_backend import RayBackend
 from benchmarks.grid.run import Run
 
 address, results, logs, *program = sys.argv[1:]
-with LocalBackend(2, program=program) if address == "local" else RayBackend(address, program=program) as backend:
+backend = LocalBackend(2, program=program) if address == "local" else RayBackend(address, program=program)
+with ended_by_sigterm(), backend:
     runs = [Run("gym_control", "Continual/CartPole-v1", "cchain", seed, 2, 800, "smoke") for seed in range(4)]
     complete(runs, Path(results), Path(logs), backend)
 """
@@ -647,7 +791,9 @@ def test_a_run_that_takes_no_time_has_a_rate(tmp_path, monkeypatch):
 
 @linux
 @pytest.mark.parametrize(
-    "backend, ending", [("local", "SIGKILL"), ("local", "SIGINT"), ("ray", "SIGKILL")], indirect=["backend"]
+    "backend, ending",
+    [("local", "SIGKILL"), ("local", "SIGINT"), ("local", "SIGTERM"), ("ray", "SIGKILL"), ("ray", "SIGTERM")],
+    indirect=["backend"],
 )
 def test_what_is_killed_goes_on(tmp_path, backend, ending, request):
     """One run is done, two are running; first one of those is killed, then the whole command."""
@@ -664,6 +810,8 @@ def test_what_is_killed_goes_on(tmp_path, backend, ending, request):
         os.kill(training if address == "local" else worker, signal.SIGKILL)
         wait_for(lambda: training not in trainings(logs), "end of the killed run", 30)
         wait_for(lambda: len(trainings(logs)) == 2, "next attempt")
+        next_one = max((path for run in runs[1:3] for path in run.path_in(logs).glob("attempt_*")), key=lambda path: path.name)
+        wait_for(lambda: list(next_one.rglob("returns.csv")), "beginning of the next attempt")
         driver.send_signal(getattr(signal, ending))
         assert driver.wait(60) != 0
     finally:
@@ -674,6 +822,9 @@ def test_what_is_killed_goes_on(tmp_path, backend, ending, request):
     written = (runs[0].path_in(results) / "run.json").stat().st_mtime_ns
     before = [attempts(run, logs) for run in runs]
     assert [len(names) for names in before] in ([1, 2, 1, 0], [1, 1, 2, 0])
+    if ending != "SIGKILL":
+        # Those that ran had time to save themselves
+        assert len(list(logs.rglob("stopped"))) == 2
 
     backend.program = fake_program(tmp_path / "fake", {})
     assert complete(runs, results, logs, backend, silent()) == []

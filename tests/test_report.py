@@ -525,6 +525,30 @@ def test_report_of_a_method_alone(tmp_path, no_drawing):
     assert "Over the environments" not in text and "Neural" not in text
 
 
+@pytest.mark.parametrize("lines", [("cchain", "cchain@1e3", "cchain@1e4"), ("cchain@1e4",)])
+def test_another_beta_has_columns_of_its_own(tmp_path, lines):
+    for seed in (0, 1):
+        write(tmp_path, "vanilla", [[-400], [-300]], seed=seed)
+        for number, line in enumerate(lines):
+            beta = {"variant": line, "overrides": (f"target_churn_ratio:{line[7:]}",)} if "@" in line else {}
+            write(tmp_path, "cchain", [[-200 + 2 * number], [-100 - seed]], seed=seed, **beta)
+    # One that was named so and has something else is none of them
+    write(tmp_path, "cchain", [[0], [0]], variant="cchain@5", overrides=("n_epochs:1",))
+    (reason,) = write_report(whole_results(tmp_path), "smoke", tmp_path)
+    assert "not under the shipped hyperparameters, but with n_epochs:1" in reason
+    text = (tmp_path / "report.md").read_text()
+    labels = ["C-CHAIN PPO", *(f"C-CHAIN PPO, β = {line[7:]}" for line in lines if "@" in line)]
+    header = next(row for row in table_rows(text) if row[0] == "J(T)")
+    assert header[-len(labels) :] == labels
+    row = next(row for row in table_rows(text) if row[:2] == ["Acrobot-v1", "here"])
+    assert [float(re.search(r"-\d+\.\d", cell)[0]) for cell in row[-len(lines) :]] == [-150.2 + i for i in range(len(lines))]
+    assert "`target_churn_ratio: 10000.0`" in text
+    # The last of them is compared with Vanilla, where the shipped one is absent
+    compared = "C-CHAIN" if "cchain" in lines else labels[-1]
+    assert f"where Vanilla and {compared} both have runs" in text and f"| {compared} over |" in text
+    assert f"--method vanilla {' '.join(lines)} --seeds 2" in text
+
+
 def test_versions_that_differ_are_told(tmp_path, no_drawing):
     write(tmp_path, "trac", [[-90], [-90]])
     write(tmp_path, "trac", [[-90], [-90]], seed=1, versions={**VERSIONS, "torch": "2.9.0"})

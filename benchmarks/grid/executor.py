@@ -1,22 +1,26 @@
 """Brings runs to their end, with the processes of this machine or with Ray, so that they survive what dies meanwhile."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
 
+from benchmarks.grid.attempts import remove_checkpoints
 from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import Result, find_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import Finished, Training, TrainingFailed
+from benchmarks.grid.training import SECONDS_TO_STOP, Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure, View
 
 # How often a run that dies, by itself or with its machine, is started again
@@ -61,6 +65,21 @@ class Backend(ABC):
         """
         return {}
 
+    def seconds_before(self) -> dict[Run, float]:
+        """
+        :return: Seconds that running runs were trained for in earlier attempts, where that is known here
+        """
+        return {}
+
+    def forget(self, run: Run, logs: Path) -> None:
+        """
+        Remove the checkpoints of a run that has a result.
+
+        :param run: The run
+        :param logs: Folder of all logs, on the machine that the run was on
+        """
+        remove_checkpoints(run, logs)
+
 
 def complete(
     runs: Sequence[Run],
@@ -71,8 +90,9 @@ def complete(
     retries: int = RETRIES,
 ) -> list[Failure]:
     """
-    Bring all runs to their end. Those that have a result are left as they are, so the same call goes on after an
-    interruption. Results are written here, whole and one by one, so machines need share no files.
+    Bring all runs to their end. Those that have a result are left as they are, and those that have a checkpoint go on from it,
+    so the same call goes on after an interruption. Results are written here, whole and one by one, so machines need share no
+    files; where they share the logs, a run goes on from its checkpoint on another machine, too.
 
     :param runs: The runs, in the order in which they are to run
     :param results: Folder of all results
@@ -104,7 +124,8 @@ def complete(
                 else:
                     write_result(replace(outcome.result, path=run.path_in(results)), outcome.returns, outcome.metrics)
                     view.finish(run, outcome.result.seconds)
-            view.progress = backend.progress()
+                    backend.forget(run, logs)
+            view.progress, view.seconds_before = backend.progress(), backend.seconds_before()
     return view.failures
 
 
@@ -119,7 +140,7 @@ def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2) -> list[Result
     :return: Their results
     """
     try:
-        with LocalBackend(n_jobs) as backend:
+        with ended_by_sigterm(), LocalBackend(n_jobs) as backend:
             failures = complete(runs, output, output / "training", backend, retries=0)
     except KeyboardInterrupt:
         sys.exit("Interrupted. The same command goes on.")
@@ -128,9 +149,45 @@ def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2) -> list[Result
     return [result for run in dict.fromkeys(runs) if (result := find_result(run, output))]
 
 
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """End the block by ``SystemExit`` on SIGTERM, so that trainings are told to save themselves, as on Ctrl-C."""
+
+    def leave(number: int, frame: object) -> None:
+        sys.exit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():  # Python allows it nowhere else
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def stop_all(trainings: Sequence[Training], seconds: float = SECONDS_TO_STOP) -> None:
+    """
+    Have trainings save themselves and end. Those that take too long are killed, and all of them when this is interrupted.
+
+    :param trainings: Trainings
+    :param seconds: How long they may take
+    """
+    try:
+        for training in trainings:
+            training.stop()
+        end = time.monotonic() + seconds
+        while any(training.is_running() for training in trainings) and time.monotonic() < end:
+            time.sleep(0.1)
+    finally:
+        for training in trainings:
+            training.kill()
+
+
 class LocalBackend(Backend):
     """
-    Processes of this machine, children of this process that do not outlive it.
+    Processes of this machine, children of this process that do not outlive it. When it is left early, they are given time to
+    save themselves.
 
     :param n_jobs: Runs at a time, None for one per core
     :param gpus_per_run: GPUs of a run, e.g. 0.25; runs that have one train on it
@@ -153,8 +210,13 @@ class LocalBackend(Backend):
         self._not_started: list[tuple[Run, Failure]] = []
 
     def __exit__(self, *error: object) -> None:
-        for training, _ in self._running.values():
-            training.kill()
+        if self._running:
+            print(
+                f"Stopping: {len(self._running)} runs save themselves, which takes up to {SECONDS_TO_STOP:.0f} seconds. "
+                "Ctrl-C again ends them at once",
+                flush=True,
+            )
+        stop_all([training for training, _ in self._running.values()])
 
     def slots(self) -> int:
         """See :class:`Backend`."""
@@ -192,6 +254,10 @@ class LocalBackend(Backend):
     def progress(self) -> dict[Run, str]:
         """See :class:`Backend`."""
         return {run: training.progress() for run, (training, _) in self._running.items()}
+
+    def seconds_before(self) -> dict[Run, float]:
+        """See :class:`Backend`."""
+        return {run: training.seconds_before for run, (training, _) in self._running.items()}
 
 
 def _visible_gpus() -> list[str]:

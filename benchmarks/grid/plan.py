@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, available_methods, make_run, paper_methods
+from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, split_line
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
 
@@ -38,16 +38,18 @@ def grid_runs(
     :param suites: Names of suites
     :param env_ids: Environments, by default all of the suites
     :param methods: Methods, in the order in which they are to run, by default all that the paper compares in the suite. A
-        method runs in those of the environments for which it has hyperparameters
+        method runs in those of the environments for which it has hyperparameters. ``cchain@1e3`` is C-CHAIN with β 1e3
     :param n_seeds: Number of seeds, from 0; by default that of the budget
     :param budget: One of ``BUDGETS``
     :return: The runs, in the order in which they are to run
-    :raises ValueError: For an environment or a method that none of the suites has, less than one seed, or when nothing is left
+    :raises ValueError: For an environment or a method that none of the suites has, a β that cannot be, less than one seed, or
+        when nothing is left
     """
     all_envs = [(suite, env_id) for suite in suites for env_id in SUITES[suite].env_ids]
     available = {name for suite, env_id in all_envs for name in available_methods(suite, env_id)}
     _check_names("env", env_ids, [env_id for _, env_id in all_envs], suites)
-    _check_names("method", methods, [name for name in METHOD_NAMES if name in available], suites)
+    lines = _same_once(methods)
+    _check_names("method", [method for method, _ in lines], [name for name in METHOD_NAMES if name in available], suites)
     if n_seeds is not None and n_seeds < 1:
         raise ValueError(f"--seeds must be at least 1; got {n_seeds}")
     grid = []
@@ -55,19 +57,25 @@ def grid_runs(
         if env_ids is not None and env_id not in env_ids:
             continue
         there = available_methods(suite, env_id)
-        chosen = [method for method in dict.fromkeys(methods or paper_methods(suite)) if method in there]
+        chosen = [line for line in lines or _same_once(paper_methods(suite)) if line[0] in there]
         n_tasks, steps = run_length(suite, env_id, budget)
         # At other budgets 30 evaluations in a task, as in the paper
         eval_freq = steps if budget == "smoke" else None
         for seed in range(n_seeds or N_SEEDS.get(budget, SUITES[suite].n_paper_seeds)):
-            for rank, method in enumerate(chosen):
-                run = make_run(suite, env_id, method, seed, n_tasks, steps, budget, eval_freq)
+            for rank, (method, beta) in enumerate(chosen):
+                line = method if beta is None else f"{method}@{beta}"
+                run = make_run(suite, env_id, line, seed, n_tasks, steps, budget, eval_freq)
                 grid.append((seed, rank, run))
     if not grid:
         raise ValueError(
             f"--method must be one with hyperparameters for {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
         )
     return [run for *_, run in sorted(grid, key=lambda entry: entry[:2])]
+
+
+def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:
+    """Methods and β, each pair once, however β is written."""
+    return list(dict.fromkeys(split_line(line) for line in lines or ()))
 
 
 def _check_names(option: str, given: Iterable[str] | None, allowed: Sequence[str], suites: Sequence[str]) -> None:
@@ -93,7 +101,8 @@ class Rates:
 
     @staticmethod
     def _keys(run: Run) -> tuple[tuple, tuple]:
-        kind = run.experiment == "smoke", run.line
+        # Another β takes no other time
+        kind = run.experiment == "smoke", run.line.partition("@")[0]
         return (*kind, run.env_id), (*kind, run.suite)
 
     def seconds(self, run: Run) -> float:

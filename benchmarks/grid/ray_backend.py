@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.grid.executor import Backend, checkout_commit
+from benchmarks.grid.attempts import remove_checkpoints
+from benchmarks.grid.executor import Backend, checkout_commit, stop_all
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import Finished, Training, TrainingFailed
+from benchmarks.grid.training import SECONDS_TO_STOP, Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure
 
 # Parts of the checkout that no run needs
@@ -50,6 +51,7 @@ class RayBackend(Backend):
         self._gpus_per_run, self.program = gpus_per_run, program
         self._git_commit = checkout_commit()
         self._running: dict[Any, Run] = {}
+        self._nodes: dict[Run, str] = {}
         self._logs = Path()
         if ":" in address:
             # Ray itself would go on trying for minutes
@@ -68,7 +70,14 @@ class RayBackend(Backend):
         self._task = ray.remote(_train).options(**options)
 
     def __exit__(self, *error: object) -> None:
-        self._ray.shutdown()
+        try:
+            if self._running:
+                print(f"Stopping: {len(self._running)} runs save themselves. Ctrl-C again ends them at once", flush=True)
+                for reference in self._running:
+                    self._ray.cancel(reference)
+                self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SECONDS_TO_STOP + 10)
+        finally:
+            self._ray.shutdown()
 
     def slots(self) -> int:
         """See :class:`Backend`."""
@@ -89,21 +98,36 @@ class RayBackend(Backend):
         for reference in ready:
             run = self._running.pop(reference)
             try:
-                ended.append((run, Finished(*self._ray.get(reference))))
+                finished, self._nodes[run] = self._ray.get(reference)
+                ended.append((run, Finished(*finished)))
             except self._ray.exceptions.RayError as error:
                 ended.append((run, _failure(run, error, self._logs)))
         return ended
 
+    def forget(self, run: Run, logs: Path) -> None:
+        """See :class:`Backend`."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-def _train(run: Run, logs: Path, device: str, git_commit: str | None, program: Sequence[str] | None) -> Finished:
-    """On a node: train to the end."""
+        # The logs are on the node that the run was on
+        there = NodeAffinitySchedulingStrategy(self._nodes.pop(run), soft=False)
+        task = self._ray.remote(remove_checkpoints).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
+        try:
+            self._ray.get(task.remote(run, logs.absolute()), timeout=60)
+        except self._ray.exceptions.RayError:
+            pass  # the node is gone
+
+
+def _train(
+    run: Run, logs: Path, device: str, git_commit: str | None, program: Sequence[str] | None
+) -> tuple[tuple[Any, ...], str]:
+    """On a node: train to the end. Returns the result, and the node."""
     training = Training(run, logs, device, git_commit, program)
     try:
         while training.is_running():
             time.sleep(0.2)
     finally:
-        training.kill()
-    return training.finish()
+        stop_all([training])
+    return tuple(training.finish()), import_ray().get_runtime_context().get_node_id()
 
 
 def count_slots(resources: dict[str, float], gpus_per_run: float) -> int:

@@ -1,17 +1,21 @@
 """What a training run is: the command that a user would type, and the settings by which a finished run counts as this one."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from benchmarks.grid.suites import SUITES, paper_length
-from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
+from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, Method
 from sb3_cchain.zoo.settings import read_settings
 
 ROOT = Path(__file__).parents[2]
+
+# Of C-CHAIN with another β than the shipped one, in the order of the values
+BETA_COLORS = ("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue")
 
 
 @dataclass(frozen=True)
@@ -125,16 +129,17 @@ def make_run(
     """
     :param suite: Name of the suite
     :param env_id: One of its environments
-    :param method: Name of a method
+    :param method: Name of a method, with another β as in ``cchain@1e3``
     :param seed: Seed
     :param n_tasks: Length of the task sequence
     :param steps_per_task: Environment steps per task
     :param experiment: What the run is part of
     :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the paper
     :return: The run
-    :raises ValueError: When the method has no settings for the environment, for more tasks than the environment has, for no
-        evaluation in a task, or for a negative seed
+    :raises ValueError: When the method has no settings for the environment, for another β that cannot be, for more tasks than
+        the environment has, for no evaluation in a task, or for a negative seed
     """
+    method, beta = split_line(method)
     for argument, value, least in (("seed", seed, 0), ("n_tasks", n_tasks, 1), ("steps_per_task", steps_per_task, 1)):
         if value < least:
             raise ValueError(f"`{argument}` must be at least {least}; got {value}")
@@ -144,11 +149,91 @@ def make_run(
         raise ValueError(f"`method` must be one of {', '.join(allowed)} in {env_id}; got {method}")
     if "n_tasks" not in SUITES[suite].env_kwargs(n_tasks, seed) and n_tasks > paper_length(env_id)[0]:
         raise ValueError(f"`n_tasks` must be at most {paper_length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
+    run = Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
+    if beta is not None:
+        run = replace(run, variant=f"{method}@{beta}", overrides=(beta_override(beta),))
     if not SUITES[suite].evaluates:
-        return Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
+        return run
     if not 0 < (steps_per_task // 30 if eval_freq is None else eval_freq) <= steps_per_task:
         raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
-    return Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment, eval_freq or steps_per_task // 30)
+    return replace(run, eval_freq=eval_freq or steps_per_task // 30)
+
+
+def split_line(line: str) -> tuple[str, str | None]:
+    """
+    :param line: Name of a method, with another β as in ``cchain@1e3``
+    :return: Name of the method; and β in its shortest form, so that ``cchain@1000`` is the same run, or None
+    :raises ValueError: When β is not a number greater than 0, or the method has none
+    """
+    method, at, text = line.partition("@")
+    if not at:
+        return line, None
+    with_beta = dict.fromkeys(row.name for row in REGISTRY if issubclass(row.algorithm, ChurnAlgorithm))
+    if method not in with_beta:
+        raise ValueError(f"`method` can have a β after @ for {', '.join(with_beta)} only; got {line}")
+    try:
+        beta = float(text)
+    except ValueError:
+        beta = math.nan
+    if not 0 < beta < math.inf:
+        raise ValueError(f"`method` must have β after @, a number greater than 0, as in {method}@1e3; got {line}")
+    return method, _shortest(beta)
+
+
+def _shortest(number: float) -> str:
+    mantissa, exponent = f"{number:e}".split("e")
+    texts = (f"{number:g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}", repr(number))
+    return min((text for text in texts if float(text) == number), key=len)
+
+
+def beta_override(beta: str) -> str:
+    """
+    :param beta: β of C-CHAIN
+    :return: What differs from the shipped hyperparameters
+    """
+    return f"target_churn_ratio:{beta}"
+
+
+def other_beta(run: Run) -> dict[str, float]:
+    """
+    :param run: A run
+    :return: β, by its name among the hyperparameters, of a run that differs from the shipped ones in β alone and is named so;
+        empty for every other run
+    """
+    try:
+        method, beta = split_line(run.variant or "")
+    except ValueError:
+        return {}
+    if beta is None or method != run.method or run.overrides != (beta_override(beta),):
+        return {}
+    return {"target_churn_ratio": float(beta)}
+
+
+def lines_in_order(lines: Iterable[str]) -> list[str]:
+    """
+    :param lines: Names of methods, some with another β
+    :return: Each once, in the order of the tables: those with another β after their method, by the value
+    """
+    return sorted(set(lines), key=lambda line: (METHOD_NAMES.index(split_line(line)[0]), float(split_line(line)[1] or 0)))
+
+
+def suite_lines(suite: str, lines: Iterable[str] = ()) -> dict[str, Method]:
+    """
+    :param suite: Name of a suite
+    :param lines: Names of methods, some with another β
+    :return: Label and colour of all methods of the suite and of those with another β, in the order of the tables
+    """
+    methods = suite_methods(suite)
+    colors = dict.fromkeys(methods, 0)
+    rows = {}
+    for line in lines_in_order([*methods, *lines]):
+        name, beta = split_line(line)
+        rows[line] = methods[name]
+        if beta is not None:
+            color = BETA_COLORS[colors[name] % len(BETA_COLORS)]
+            colors[name] += 1
+            rows[line] = replace(methods[name], label=f"{methods[name].label}, β = {beta}", color=color)
+    return rows
 
 
 def paper_methods(suite: str) -> list[str]:

@@ -33,6 +33,8 @@ class Suite:
     :param rates: Measured environment steps per second on one core, by method; of methods that are missing, Vanilla's
     :param smoke_steps: Environment steps per task of a smoke run, enough for a return in each of two tasks
     :param demo: What the demo shows
+    :param checkpoint_freq: Environment steps from one checkpoint of a run to the next, so that saving takes less than 2 % of a
+        run
     :param algo: Name on the command line of its algorithm without churn reduction
     :param n_paper_seeds: Number of seeds in the paper
     :param reduce_length: From the paper's number of tasks and steps per task to those of the budget ``reduced``
@@ -48,6 +50,7 @@ class Suite:
     rates: Mapping[str, float]
     smoke_steps: int
     demo: Demo
+    checkpoint_freq: int
     algo: str = "ppo"
     n_paper_seeds: int = 6
     # All tasks, a tenth of their lengths; not claimed to be long enough for the paper's effects
@@ -75,6 +78,7 @@ SUITES = {
             *("Continual/Acrobot-v1", 4, 32_000),
             "After each switch the same swing-up is seen through observations with another offset. The worst return is -400.",
         ),
+        checkpoint_freq=20_000,
         # Two fifths of the tasks and of their lengths: 4 x 64 000, and 2 x 128 000 in MountainCar. Four tasks of 80 rollouts
         # are enough for Vanilla to collapse and C-CHAIN not to (docs/results/gym_control.md). A run takes 9 to 10 minutes of a
         # core: 72 runs (4 environments, 6 methods, 3 seeds) take less than 12 core-hours
@@ -93,6 +97,7 @@ SUITES = {
             *("Continual/Starpilot-v0", 3, 3000),
             "After each switch it is another level of the same game. Learning takes 100 times longer than this.",
         ),
+        checkpoint_freq=10_000,
         env_kwargs=lambda n_tasks, seed: {"n_tasks": n_tasks},
     ),
     # The paper evaluates with sampled actions and the normalisation of the moment; the episodes of training have both, too
@@ -107,6 +112,7 @@ SUITES = {
             "After each switch the same robot has another goal, which only the rewards tell it. At this length C-CHAIN's "
             "coefficient stays at its warm-up value.",
         ),
+        checkpoint_freq=60_000,
         n_paper_seeds=12,
         own_scales=True,
     ),
@@ -121,6 +127,7 @@ SUITES = {
             "After each switch it is another game. The first 10 000 actions in each are random. The returns are those of "
             "greedy evaluations. Learning takes 50 times longer than this.",
         ),
+        checkpoint_freq=50_000,
         algo="double_dqn",
         n_paper_seeds=12,
         evaluates=True,

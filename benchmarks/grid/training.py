@@ -1,5 +1,6 @@
 """One attempt at a run: a training process, and what is read from its logs."""
 
+import math
 import os
 import platform
 import re
@@ -8,23 +9,22 @@ import signal
 import subprocess
 import sys
 import time
-import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.grid.attempts import Attempt, new_attempt
 from benchmarks.grid.results import METRIC_PREFIXES, Result
 from benchmarks.grid.run import Run, as_json, shipped_hyperparameters
 from benchmarks.grid.suites import SUITES, task_names
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 
-# Packages whose versions are recorded
-PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
+# How long a training that is told to stop may take to save itself: it first completes its rollout
+SECONDS_TO_STOP = 60.0
 
 
 class TrainingFailed(RuntimeError):
@@ -56,6 +56,8 @@ class Training:
     starts a task again when it has lost sight of a machine, which may still be alive. On Linux a process whose parent died
     dies too (``child.py``); that frees its core for the next attempt, but correctness does not depend on it.
 
+    An attempt goes on from the newest checkpoint of the attempts before, as if they had not been interrupted.
+
     :param run: The run
     :param logs: Folder of all logs
     :param device: PyTorch device
@@ -74,14 +76,15 @@ class Training:
         environment: dict[str, str] | None = None,
     ):
         self.run = run
-        self._device, self._git_commit = device, git_commit
-        self._started = datetime.now(timezone.utc)
+        self._device = device
         self._clock = time.monotonic()
         self._memory: int | None = None
-        self.folder = run.path_in(logs) / f"attempt_{self._started:%Y%m%dT%H%M%S}_{uuid.uuid4().hex[:8]}"
-        self.folder.mkdir(parents=True)
+        self.attempt, checkpoint = new_attempt(run, logs, git_commit)
+        self.folder = self.attempt.folder
         self.log = self.folder / "log.txt"
-        arguments = run.arguments(self.folder, device)
+        arguments = [*run.arguments(self.folder, device), "--checkpoint-freq", str(SUITES[run.suite].checkpoint_freq)]
+        if checkpoint is not None:
+            arguments += ["--resume", str(checkpoint)]
         with open(self.log, "w") as log:
             log.write(f"sb3-cchain {shlex.join(arguments)}\n")
             log.flush()
@@ -89,8 +92,13 @@ class Training:
             variables = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}
             child = [sys.executable, str(Path(__file__).with_name("child.py")), str(os.getpid())]
             program = program or (sys.executable, "-m", "sb3_cchain.zoo.cli")
+            # In a session of its own, so that Ctrl-C does not reach it: the parent tells it to stop, once
             self._process = subprocess.Popen(
-                [*child, *program, *arguments], stdout=log, stderr=subprocess.STDOUT, env=variables
+                [*child, *program, *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=variables,
+                start_new_session=True,
             )
 
     def is_running(self) -> bool:
@@ -108,7 +116,18 @@ class Training:
             last = self._training_returns()[-1]
         except (IndexError, ValueError, TypeError, OSError):
             return ""  # nothing there yet, or the line is being written
-        return f"{last['timesteps'] / self.run.total_steps:.0%}, task {last['task_id']}, return {last['mean_return']:.0f}"
+        done = f"{last['timesteps'] / self.run.total_steps:.0%}, task {last['task_id']}, return {last['mean_return']:.0f}"
+        origin = self.attempt.origin
+        return done if origin is None else f"{done}, from {origin.num_timesteps / self.run.total_steps:.0%}"
+
+    @property
+    def seconds_before(self) -> float:
+        """Seconds that earlier attempts trained up to the checkpoint that this one goes on from."""
+        return 0.0 if self.attempt.origin is None else self.attempt.origin.seconds
+
+    def stop(self) -> None:
+        """Tell the process to save its training and to end, without waiting for it."""
+        self._process.terminate()
 
     def kill(self) -> None:
         """End the process, if it has not ended yet."""
@@ -120,10 +139,16 @@ class Training:
         :return: The result of a process that has ended, not written yet, and its rows
         :raises TrainingFailed: When the process failed
         """
-        run, seconds = self.run, time.monotonic() - self._clock
+        run, seconds = self.run, time.monotonic() - self._clock + self.seconds_before
         if self._process.returncode != 0:
+            if self._process.returncode > 0 and not self._has_trained():
+                self.attempt.mark_broken()
             reason = _failure_reason(self.log, self._process.returncode)
             raise TrainingFailed(reason, str(self.log), platform.node())
+        try:
+            chain = self.attempt.chain()
+        except ValueError as error:  # its logs were removed meanwhile
+            raise TrainingFailed(str(error), str(self.log), platform.node()) from error
         # In the command the folder that a user would choose, not the attempt's
         command = ["sb3-cchain", *run.arguments(run.path_in(Path("logs/grid")), self._device)]
         result = Result(
@@ -132,15 +157,24 @@ class Training:
             task_names=list(task_names(run.suite, run.env_id, run.n_tasks)),
             hyperparameters=as_json(shipped_hyperparameters(run.algo, run.env_id)),
             command=command,
-            versions={**{name: version(name) for name in (*PACKAGES, "numpy")}, "python": platform.python_version()},
-            git_commit=self._git_commit,
-            started=self._started.isoformat(timespec="seconds"),
+            versions={name: _joined(attempt.versions.get(name) for attempt in chain) or "" for name in chain[-1].versions},
+            git_commit=_joined(attempt.git_commit for attempt in chain),
+            started=chain[0].started,
             finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             seconds=max(round(seconds, 1), 0.1),  # by which rates are divided
             peak_memory=self._memory,
         )
         returns = self._evaluations() if SUITES[run.suite].evaluates else self._training_returns()
-        return Finished(result, returns, self._metrics())
+        return Finished(result, returns, metrics_rows(chain))
+
+    def _has_trained(self) -> bool:
+        """Whether there is more than what the checkpoint held that it went on from."""
+        try:
+            returns = self._training_returns()
+        except ValueError:
+            return True
+        before = 0 if self.attempt.origin is None else self.attempt.origin.num_timesteps
+        return any(row["timesteps"] > before for row in returns)
 
     def _training_returns(self) -> list[dict[str, float]]:
         """Rows of ``returns.csv`` so far."""
@@ -164,19 +198,41 @@ class Training:
             for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
         ]
 
-    def _metrics(self) -> list[dict[str, Any]]:
-        """Rows of ``metrics.csv``: what was logged to TensorBoard, to six digits."""
-        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-        rows = []
-        for folder in sorted({file.parent for file in self.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
+def metrics_rows(chain: Sequence[Attempt]) -> list[dict[str, Any]]:
+    """
+    :param chain: Attempts, each of which goes on from a checkpoint of the one before
+    :return: Rows of ``metrics.csv``: what they logged to TensorBoard, to six digits. What an attempt logged after the
+        checkpoint that the next one goes on from is left out, because it comes again
+    """
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    # By name, and by environment steps
+    values: dict[str, dict[int, list[str]]] = {}
+    for attempt, following in zip(chain, [*chain[1:], None], strict=True):
+        last = math.inf if following is None or following.origin is None else following.origin.num_timesteps
+        logged_here: dict[str, dict[int, list[str]]] = {}
+        for folder in sorted({file.parent for file in attempt.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
             logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
             logged.Reload()
             for name in logged.Tags()["scalars"]:
                 if name.startswith(METRIC_PREFIXES):
-                    values = logged.Scalars(name)
-                    rows += [{"timesteps": event.step, "name": name, "value": f"{event.value:.6g}"} for event in values]
-        return rows
+                    for event in logged.Scalars(name):
+                        if event.step <= last:
+                            logged_here.setdefault(name, {}).setdefault(event.step, []).append(f"{event.value:.6g}")
+        for name, by_step in logged_here.items():
+            values.setdefault(name, {}).update(by_step)
+    return [
+        {"timesteps": step, "name": name, "value": value}
+        for name, by_step in values.items()
+        for step, logged_values in by_step.items()
+        for value in logged_values
+    ]
+
+
+def _joined(texts: Iterable[str | None]) -> str | None:
+    """Each text once: what attempts have in common, or in what they differ."""
+    return ", ".join(dict.fromkeys(text for text in texts if text is not None)) or None
 
 
 def _peak_memory(pid: int) -> int | None:

@@ -67,6 +67,8 @@ class View:
         self.n_before, self.n_done = n_done, n_done
         self.slots = 1
         self.progress: dict[Run, str] = {}
+        # Seconds that running runs were trained for in earlier attempts
+        self.seconds_before: dict[Run, float] = {}
         self._rates = rates
         # Seconds of the runs that have finished here: estimated, and real
         self._estimated, self._real = 0.0, 0.0
@@ -115,15 +117,19 @@ class View:
         words = f"{failure}{' (tried again)' * again}"
         self.console.print(f"[red]{escape(words)}[/red]", soft_wrap=True, highlight=False)
 
+    def _seconds(self, run: Run) -> float:
+        """How long a running run has been trained, earlier attempts included."""
+        started = self.running.get(run, math.inf)  # it may have ended meanwhile
+        return max(time.monotonic() - started, 0.0) + self.seconds_before.get(run, 0.0)
+
     def time_left(self) -> float:
         """
         :return: Seconds: the estimate of the rest, corrected by how long the runs that finished here really took, and divided
             by the number of runs at a time
         """
         factor = self._real / self._estimated if self._estimated else 1.0
-        now = time.monotonic()
         # Copies, because the view is drawn by a thread of its own
-        running = [max(factor * self._rates.seconds(run) - (now - start), 0.0) for run, start in list(self.running.items())]
+        running = [max(factor * self._rates.seconds(run) - self._seconds(run), 0.0) for run in list(self.running)]
         waiting = [factor * self._rates.seconds(run) for run in list(self.waiting)]
         # No shorter than the longest of those running
         return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
@@ -138,10 +144,9 @@ class View:
             (f"{len(self.failures)} failed", "red" if self.failures else ""),
             f", {duration(self.time_left())} left",
         )
-        now = time.monotonic()
         running = Table.grid(padding=(0, 2))
-        for run, start in list(self.running.items())[:20]:
-            running.add_row("", run.name, duration(now - start), self.progress.get(run, ""))
+        for run in list(self.running)[:20]:
+            running.add_row("", run.name, duration(self._seconds(run)), self.progress.get(run, ""))
         if len(self.running) > 20:
             running.add_row("", f"and {len(self.running) - 20} more")
         failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]

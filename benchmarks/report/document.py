@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import as_json, shipped_hyperparameters, short_name, suite_methods
+from benchmarks.grid.run import (
+    as_json,
+    lines_in_order,
+    other_beta,
+    shipped_hyperparameters,
+    short_name,
+    suite_lines,
+    suite_methods,
+)
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cells, make_cells, versions_text
 from benchmarks.report.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
@@ -18,6 +26,7 @@ from benchmarks.report.page import html_page
 from benchmarks.report.paper import AGGREGATE, Table, read_tables
 from benchmarks.report.quantities import NTK
 from benchmarks.report.tables import (
+    cchain_line,
     lengths_table,
     mark_differences,
     method_label,
@@ -27,7 +36,6 @@ from benchmarks.report.tables import (
     table_methods,
 )
 from benchmarks.report.task_tables import MISSING, quantities_table, returns_header, returns_rows, seeds_text
-from sb3_cchain.methods.registry import METHOD_NAMES
 
 PICTURES = "pictures"
 
@@ -103,7 +111,7 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
     for result in results:
         if result.suite not in tables or result.env_id not in tables[result.suite].lengths:
             left_out.append(f"{result.path}: the paper has no {result.env_id} in {result.suite}")
-        elif result.variant is not None or result.overrides:
+        elif (result.variant is not None or result.overrides) and not other_beta(result):
             left_out.append(f"{result.path}: not under the shipped hyperparameters, but with {', '.join(result.overrides)}")
         else:
             by_suite[result.suite].append(result)
@@ -185,6 +193,11 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
     ]
     if different:
         notes.append("\n".join(different))
+    if any("@" in line for _, line in cells):
+        notes.append(
+            "Columns with β = are C-CHAIN under the shipped hyperparameters but for β. The paper has no cells of single β: it "
+            "prints the best of three under C-CHAIN."
+        )
     most = max((cell.seeds for cell in cells.values()), key=len, default=[])
     fewer: dict[str, list[str]] = {}
     for (env_id, method), cell in cells.items():
@@ -206,7 +219,8 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
     differences: dict[tuple[str, str], list[str]] = {}
     for env_id, runs in _by_env(results, paper).items():
         vanilla = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
-        for method, hyperparameters in {run.method: run.hyperparameters for run in runs if run.method != "vanilla"}.items():
+        shown = {run.line: {**run.hyperparameters, **other_beta(run)} for run in runs if run.method != "vanilla"}
+        for method, hyperparameters in shown.items():
             differing = [code(f"{name}: {value}") for name, value in hyperparameters.items() if vanilla.get(name) != value]
             key = method_label(suite, method), ", ".join(differing) or "not in the settings"
             differences.setdefault(key, []).append(short_name(env_id))
@@ -217,7 +231,7 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
         "\n".join(lines) if lines else "Nothing else was run.",
     ]
     others = [
-        f"- {short_name(result.env_id)}, {method_label(suite, result.method)}, seed {result.seed}"
+        f"- {short_name(result.env_id)}, {method_label(suite, result.line)}, seed {result.seed}"
         for result in results
         if result.hyperparameters != as_json(shipped_hyperparameters(result.algo, result.env_id))
     ]
@@ -229,7 +243,8 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
 def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Pictures) -> list[str]:
     """rliable's metrics over the environments."""
     env_ids, scores, seeds = score_matrices(cells, paper)
-    if not {"vanilla", "cchain"} <= set(scores):
+    cchain = cchain_line(cells)
+    if not {"vanilla", cchain} <= set(scores):
         return []
     low, high = (np.array([end(paper.means(env_id).values()) for env_id in env_ids]) for end in (min, max))
     estimates, intervals = reliable_metrics({method: normalized(matrix, low, high) for method, matrix in scores.items()})
@@ -243,7 +258,7 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Picture
         rows.append([method_label(suite, method), seeds_text(seeds[method]), *figures])
     without = [method_label(suite, method) for method in table_methods(cells, paper) if method not in scores]
     words = [
-        f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and C-CHAIN both have runs. "
+        f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and {cchain_words(suite, cchain)} both have runs. "
         + (f"Left out, because they do not have runs in all of them: {', '.join(without)}. " if without else "")
         + NORMALIZATION
     ]
@@ -251,7 +266,7 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Picture
     if several:
         path, picture = pictures.add(f"metrics_{suite}", f"Metrics over the environments of {SUITES[suite].title}")
         plot_reliable_metrics(
-            {name: estimates[name] for name in several}, intervals, list(METRICS), suite_methods(suite), path
+            {name: estimates[name] for name in several}, intervals, list(METRICS), suite_lines(suite, several), path
         )
         shown = [picture]
     header = ["method", "seeds", *METRICS]
@@ -260,26 +275,35 @@ def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Picture
         *words,
         markdown_table(header, rows),
         *shown,
-        *_improvement(suite, env_ids, scores, several, paper),
+        *_improvement(suite, env_ids, cchain, scores, several, paper),
     ]
 
 
+def cchain_words(suite: str, line: str) -> str:
+    """
+    :param suite: Name of a suite
+    :param line: C-CHAIN, or C-CHAIN with another β
+    :return: How the text calls it
+    """
+    return "C-CHAIN" if line == "cchain" else method_label(suite, line)
+
+
 def _improvement(
-    suite: str, env_ids: Sequence[str], scores: Mapping[str, np.ndarray], several: Sequence[str], paper: Table
+    suite: str, env_ids: Sequence[str], cchain: str, scores: Mapping[str, np.ndarray], several: Sequence[str], paper: Table
 ) -> list[str]:
     """C-CHAIN against each other method."""
     rows = []
-    for method, (probability, interval) in probability_of_improvement(scores, "cchain").items():
+    for method, (probability, interval) in probability_of_improvement(scores, cchain).items():
         text = f"{probability:.2f}"
-        if method in several and "cchain" in several:
+        if method in several and cchain in several:
             text += f" [{interval[0]:.2f}, {interval[1]:.2f}]"
-        higher = int((scores["cchain"].mean(axis=0) > scores[method].mean(axis=0)).sum())
+        higher = int((scores[cchain].mean(axis=0) > scores[method].mean(axis=0)).sum())
         in_paper = MISSING
         if method in paper.methods:
             means = [paper.means(env_id) for env_id in env_ids]
             in_paper = f"{sum(mean['cchain'] > mean[method] for mean in means)} of {len(env_ids)}"
         rows.append([method_label(suite, method), text, f"{higher} of {len(env_ids)}", in_paper])
-    header = ["C-CHAIN over", "probability of improvement", "higher mean, here", "higher mean, paper"]
+    header = [f"{cchain_words(suite, cchain)} over", "probability of improvement", "higher mean, here", "higher mean, paper"]
     return [
         IMPROVEMENT,
         markdown_table(header, rows),
@@ -288,7 +312,7 @@ def _improvement(
 
 def _curves_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
     """Learning curves of each environment."""
-    lines = suite_methods(suite)
+    lines = suite_lines(suite, (result.line for result in results))
     window = SUITES[suite].smoothing
     smooth = f", a running mean over {window} rollouts within a task," if window > 1 else ""
     parts = [
@@ -306,7 +330,7 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, picture
 
 def _ntk_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
     """The neural tangent kernel, of the runs that logged it."""
-    lines = suite_methods(suite)
+    lines = suite_lines(suite, (result.line for result in results))
     logged = [result for result in results if NTK[0].name in result.metrics]
     if not logged:
         return []
@@ -337,7 +361,7 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
     commands = []
     for suite in dict.fromkeys(result.suite for result in results):
         runs = [result for result in results if result.suite == suite]
-        methods = " ".join(method for method in METHOD_NAMES if any(run.method == method for run in runs))
+        methods = " ".join(lines_in_order(run.line for run in runs))
         n_seeds = 1 + max(run.seed for run in runs)
         commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} --method {methods} --seeds {n_seeds}")
     commands.append(f"python -m benchmarks.report --budget {budget}")

@@ -5,31 +5,30 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import short_name, suite_methods
+from benchmarks.grid.run import lines_in_order, short_name, split_line, suite_lines
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.estimates import agrees, best_two
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import AGGREGATE, Table
 from benchmarks.report.task_tables import MISSING, seeds_text
-from sb3_cchain.methods.registry import METHOD_NAMES
 
 
 def method_label(suite: str, method: str) -> str:
     """
     :param suite: Name of a suite
-    :param method: Name of a method
+    :param method: Name of a method, also with another β
     :return: The method's label in that suite
     """
-    return suite_methods(suite)[method].label
+    return suite_lines(suite, [method])[method].label
 
 
 def table_methods(cells: Cells, paper: Table) -> list[str]:
     """
     :param cells: Cells of a suite
     :param paper: The paper's table
-    :return: The methods that are in either, in the order of the tables
+    :return: The methods that are in either, also with another β, in the order of the tables
     """
-    return [method for method in METHOD_NAMES if method in paper.methods or any(name == method for _, name in cells)]
+    return lines_in_order([*paper.methods, *(line for _, line in cells)])
 
 
 def lengths_table(results: Sequence[Result], paper: Table) -> str:
@@ -127,16 +126,16 @@ def mark_differences(suite: str, paper: Table) -> list[str]:
 
 def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.ndarray], dict[str, list[int]]]:
     """
-    The part of a table that can be aggregated over environments: the environments in which both Vanilla and C-CHAIN have runs,
-    and the methods and seeds that are in all of these.
+    The part of a table that can be aggregated over environments: the environments in which both Vanilla and C-CHAIN
+    (:func:`cchain_line`) have runs, and the methods and seeds that are in all of these.
 
     :param cells: Cells of a suite
     :param paper: The paper's table
     :return: Environments; J(T) of each method, ``(n_seeds, n_environments)``; and each method's seeds
     """
-    env_ids = [env_id for env_id in paper.lengths if {(env_id, "vanilla"), (env_id, "cchain")} <= set(cells)]
+    env_ids = [env_id for env_id in paper.lengths if {(env_id, "vanilla"), (env_id, cchain_line(cells))} <= set(cells)]
     matrices, seeds_of = {}, {}
-    for method in METHOD_NAMES:
+    for method in lines_in_order(line for _, line in cells):
         method_cells: list[Cell | None] = [cells.get((env_id, method)) for env_id in env_ids]
         complete = [cell for cell in method_cells if cell is not None]
         if not complete or len(complete) < len(env_ids):
@@ -147,6 +146,15 @@ def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.
             matrices[method] = np.array([[scores[seed] for scores in by_seed] for seed in seeds])
             seeds_of[method] = seeds
     return env_ids, matrices, seeds_of
+
+
+def cchain_line(cells: Cells) -> str:
+    """
+    :param cells: Cells of a suite
+    :return: C-CHAIN or, where it was run with other β alone, the one of these that has most environments
+    """
+    lines = [line for _, line in cells if split_line(line)[0] == "cchain"]
+    return "cchain" if "cchain" in lines or not lines else max(lines_in_order(lines), key=lines.count)
 
 
 def table_digits(paper: Table) -> int:

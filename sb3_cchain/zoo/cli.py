@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 import warnings
+from functools import partial
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,6 +26,7 @@ from sb3_cchain.checkpoint import check_model_file
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo import inspect as zoo_inspect
+from sb3_cchain.zoo.checkpoint_options import find_resumed, make_parser, take_options
 from sb3_cchain.zoo.experiment import ExperimentManager
 from sb3_cchain.zoo.search import register_search_spaces
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
@@ -92,7 +94,7 @@ def main() -> None:
     if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
         sys.exit(
             f"usage: sb3-cchain {{{'|'.join(COMMANDS)}}} ...\n"
-            "All but inspect have the options of RL Zoo. Each lists them: sb3-cchain train --help"
+            "All but inspect have the options of RL Zoo, and train more. Each lists them: sb3-cchain train --help"
         )
     command = sys.argv[1]
     register_algorithms(playing=command in PLAYING)
@@ -102,10 +104,27 @@ def main() -> None:
             zoo_inspect.main(sys.argv[2:])
         elif command in MODULES:
             run_module(command)
+        elif command == "train":
+            train(sys.argv[2:])
         else:
-            if command == "train":
-                sys.argv[2:] = add_settings_file(sys.argv[2:])
             run_script(command)
+
+
+def train(arguments: list[str]) -> None:
+    """
+    RL Zoo's ``train``, with the settings of this package, and with checkpoints.
+
+    :param arguments: Arguments of the command line
+    :raises SystemExit: When options do not go together, or training was interrupted
+    """
+    if {"-h", "--help"} & set(arguments):
+        print(make_parser().format_help())
+    checkpoints, rest = take_options(arguments)
+    if checkpoints is not None:
+        checkpoints, rest = find_resumed(checkpoints, rest)
+    sys.argv[2:] = add_settings_file(rest)
+    with replaced(rl_zoo3.train, "ExperimentManager", partial(ExperimentManager, checkpoints=checkpoints)):
+        run_script("train")
 
 
 def run_script(name: str) -> None:

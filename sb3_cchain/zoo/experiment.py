@@ -1,12 +1,17 @@
 """RL Zoo's training, with run folders that are never shared, saves that a kill does not tear, and training that goes on."""
 
 import re
+import shutil
+import signal
+import sys
+from collections.abc import Callable
 from copy import copy
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import optuna
 import rl_zoo3.exp_manager
 from rl_zoo3.utils import get_latest_run_id
@@ -14,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.checkpoint import (
     SafeCheckpointCallback,
@@ -25,9 +30,13 @@ from sb3_cchain.checkpoint import (
     saved_timesteps,
     write_safely,
 )
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint
+from sb3_cchain.checkpoint.resumable_env import ResumableEnv
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
+from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, differences, plain, write_record
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
 
 
@@ -40,8 +49,35 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
       ``restart=False`` in it, it does not). Where there are no tasks it is Stable-Baselines3's ``VecNormalize``.
     - Checkpoints, the best and the final model are whole or absent. They come with the statistics of ``VecNormalize``.
     - Training from a saved model (``-i``) goes on at its step, its task and its statistics.
+    - Training with checkpoints (``--checkpoint-freq``) goes on exactly (``--resume``).
     - ``-optimize`` searches the grids of the related methods.
+
+    :param args: Arguments of RL Zoo's
+    :param checkpoints: The options on checkpoints, None without checkpoints
+    :param kwargs: Keyword arguments of RL Zoo's
     """
+
+    def __init__(self, *args: Any, checkpoints: CheckpointOptions | None = None, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.checkpoints = checkpoints
+        self.resumed = None if checkpoints is None else checkpoints.checkpoint
+        if self.resumed is not None:
+            self.trained_agent = str(self.resumed.model_path)
+            self.continue_training = True
+        self._was_interrupted = False
+
+    @property
+    def checkpoint_folder(self) -> Path:
+        """Folder of the checkpoints."""
+        return Path(self.save_path) / CHECKPOINTS
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        :return: The hyperparameters, twice: for use and as they are saved
+        """
+        hyperparams, saved = super().read_hyperparameters()
+        self._hyperparameters_read = plain(saved)  # what follows changes parts of them in place
+        return hyperparams, saved
 
     def create_log_folder(self) -> None:
         """
@@ -49,13 +85,47 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
         :raises ValueError: When training is to go on from a file that is no whole model, that lacks its statistics, or that
             was trained to the end
+        :raises SystemExit: When training is to go on from a checkpoint of another training, or from one that is at its end
         """
-        if self.continue_training:
+        if self.resumed is not None:
+            self._check_resumed(self.resumed)
+        elif self.continue_training:
             self._check_trained_agent()
         if not self.args.uuid:
             self.save_path = str(make_run_folder(self.log_path, self.env_name))
             self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
+        if self.checkpoints is not None:
+            write_record(self.checkpoint_folder, self.checkpoints, self.args, self._hyperparameters_read)
+        if self.resumed is not None:
+            (Path(self.save_path) / RESUMED_FROM).write_text(f"{self.resumed.path.resolve()}\n")
+            self._copy_best(self.resumed.folder.parent)
+
+    def _check_resumed(self, checkpoint: Checkpoint) -> None:
+        assert self.checkpoints is not None
+        if differing := differences(self.checkpoints.record, self.args, self._hyperparameters_read):
+            sys.exit(f"--resume: the training in {checkpoint.path} had {'; '.join(differing)}. Give the options that it had")
+        done, final = checkpoint.num_timesteps, checkpoint.folder.parent / f"{self.env_name}.zip"
+        # One who names a checkpoint wants to go on from there in any case
+        if checkpoint.path != self.checkpoints.resume and final.is_file():
+            done = max(done, saved_timesteps(final))
+        if done >= self.n_timesteps:
+            print(
+                f"The training in {checkpoint.folder.parent} is finished: it made {done} of {self.n_timesteps} steps. "
+                "A greater number of steps makes it longer: -n STEPS"
+            )
+            sys.exit(0)
+        self.n_timesteps -= checkpoint.num_timesteps
+
+    def _copy_best(self, folder: Path) -> None:
+        """
+        Copy what evaluations have left in the run folder that training goes on from. What is of later evaluations than the
+        checkpoint will come again.
+        """
+        for name in ("evaluations.npz", "best_model.zip", f"{self.env_name}/vecnormalize.pkl"):
+            if (folder / name).is_file():
+                with write_safely(f"{self.save_path}/{name}") as path:
+                    shutil.copyfile(folder / name, path)
 
     def _check_trained_agent(self) -> None:
         check_model_file(self.trained_agent)
@@ -93,6 +163,31 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
                     f"{self.save_path}/best_model.zip", f"{self.params_path}/vecnormalize.pkl"
                 )
                 callback.callback_on_new_best.parent = callback
+        if self.checkpoints is not None:
+            self.callbacks.append(self._make_checkpoint_callback(self.checkpoints))
+
+    def _make_checkpoint_callback(self, options: CheckpointOptions) -> TrainingCheckpoint:
+        assert options.freq is not None
+        callback = TrainingCheckpoint(options.freq, self.checkpoint_folder, options.keep)
+        callback.advice = f"To go on from there:\n{options.resume_command(Path(self.save_path))}"
+        if self.resumed is not None:
+            callback.go_on_from(self.resumed)
+        return callback
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        Make the environments. With checkpoints, those in processes of their own are made resumable.
+
+        :param n_envs: Number of environments
+        :param eval_env: Whether they are for evaluation
+        :param no_log: Whether episodes are logged nowhere
+        :return: The vectorised environment
+        """
+        wrapper = self.env_wrapper
+        if self.checkpoints is not None and self.vec_env_class is SubprocVecEnv:
+            wrapper = partial(_resumable, wrapper)
+        with replaced(self, "env_wrapper", wrapper):
+            return super().create_envs(n_envs, eval_env, no_log)
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         if not self.normalize:
@@ -101,6 +196,12 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         return TaskVecNormalize(env, **{**self.normalize_kwargs, **evaluation})
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.resumed is not None:
+            # The rest, statistics and replay buffer included, is put back when training starts
+            kept = {name: value for name, value in hyperparams.items() if name not in ("policy", "policy_kwargs")}
+            for name in ("seed", "tensorboard_log", "verbose", "device"):
+                kept[name] = getattr(self, name)
+            return rl_zoo3.ALGOS[self.algo].load(self.trained_agent, env=env, **kept)
         normalize = unwrap_vec_normalize(env)
         if normalize is not None:
             load_statistics(normalize, self._find_statistics())
@@ -113,21 +214,29 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         Train a model. One that was loaded goes on counting its steps.
 
         :param model: The model
+        :raises SystemExit: With checkpoints, when training was stopped by SIGTERM
         """
         if self.tensorboard_log is not None:
             folder = make_run_folder(self.tensorboard_log, type(model).__name__)
             model.set_logger(configure(str(folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
-        if self.continue_training:
-            # RL Zoo's method has no place for `reset_num_timesteps`
-            learn = partial(model.learn, reset_num_timesteps=False)
-            model = SimpleNamespace(learn=learn, env=model.env, policy=model.policy)  # type: ignore[assignment]
-        super().learn(model)
+        # RL Zoo's method has no place for `reset_num_timesteps`
+        learn = partial(model.learn, reset_num_timesteps=False) if self.continue_training else model.learn
+
+        def learn_and_tell(*args: Any, **kwargs: Any) -> None:
+            try:
+                learn(*args, **kwargs)
+            except KeyboardInterrupt:  # which RL Zoo takes for the end
+                self._was_interrupted = True
+                raise
+
+        super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
         Save the model, the statistics of its ``VecNormalize`` if there is one, and its replay buffer if asked for.
 
         :param model: The model
+        :raises SystemExit: With checkpoints, when training was interrupted by Ctrl-C
         """
         print(f"Saving to {self.save_path}")
         normalize = model.get_vec_normalize_env()
@@ -139,6 +248,8 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             with write_safely(f"{self.save_path}/replay_buffer.pkl") as path:
                 model.save_replay_buffer(path)
         save_model(model, f"{self.save_path}/{self.env_name}.zip")
+        if self._was_interrupted and self.checkpoints is not None:
+            sys.exit(128 + signal.SIGINT)
 
     def objective(self, trial: optuna.Trial) -> float:
         """
@@ -158,6 +269,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             else:
                 manager.specified_callbacks = add_to_callback(self.specified_callbacks, method.callbacks[0], values)
         return super(ExperimentManager, manager).objective(trial)
+
+
+def _resumable(wrapper: Callable[[gym.Env], gym.Env] | None, env: gym.Env) -> ResumableEnv:
+    """An environment with the settings' wrapper, and outside of it what makes it resumable."""
+    return ResumableEnv(env if wrapper is None else wrapper(env))
 
 
 def make_run_folder(parent: str | Path, name: str) -> Path:

@@ -1,0 +1,200 @@
+"""The options of ``sb3-cchain train`` that RL Zoo does not have: checkpoints, and training that goes on exactly from one."""
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from sb3_cchain.checkpoint import write_safely
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
+
+# In a run folder
+CHECKPOINTS = "checkpoints"
+RESUMED_FROM = "resumed_from"
+# Beside the checkpoints: what the training was started with
+COMMAND = "command.json"
+
+# Checkpoints that stay
+KEEP = 2
+
+# Options of RL Zoo that training depends on, and evaluations, which draw random numbers
+COMPARED = (
+    *("algo", "env", "seed", "env_kwargs", "eval_env_kwargs", "vec_env", "eval_freq", "eval_episodes", "n_eval_envs"),
+    *("save_freq", "log_interval", "progress"),  # callbacks must be the same, and logs go on
+)
+
+
+class CheckpointOptions(NamedTuple):
+    """
+    What the options say.
+
+    :param freq: Environment steps between two checkpoints, None for as many as in the training that goes on
+    :param keep: How many of the newest checkpoints stay
+    :param typed: The other arguments, as typed
+    :param resume: Where the checkpoint is that training goes on from, None for training from the start
+    :param checkpoint: That checkpoint
+    :param record: What that training was started with, see :func:`write_record`
+    """
+
+    freq: int | None
+    keep: int
+    typed: Sequence[str]
+    resume: Path | None = None
+    checkpoint: Checkpoint | None = None
+    record: Mapping[str, Any] = MappingProxyType({})
+
+    def resume_command(self, folder: Path) -> str:
+        """
+        :param folder: A run folder
+        :return: The command that goes on from its newest checkpoint
+        """
+        return shlex.join(["sb3-cchain", "train", *self.typed, "--resume", str(folder)])
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    :return: The parser of these options alone
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-cchain train",
+        usage=argparse.SUPPRESS,
+        description="Options of sb3-cchain. Those of RL Zoo follow.",
+        add_help=False,
+        allow_abbrev=False,
+    )
+    group = parser.add_argument_group("checkpoints to go on from exactly")
+    group.add_argument(
+        "--checkpoint-freq",
+        type=int,
+        metavar="STEPS",
+        help="Save all of the training every so many environment steps, and on Ctrl-C or SIGTERM, in the folder `checkpoints` "
+        "of the run",
+    )
+    group.add_argument(
+        "--checkpoint-keep", type=int, metavar="N", help=f"How many of the newest checkpoints stay (default: {KEEP})"
+    )
+    group.add_argument(
+        "--resume",
+        type=Path,
+        metavar="PATH",
+        help="Go on exactly from a checkpoint, from the newest in a folder of checkpoints, or from that of a run folder. All "
+        "other options must be those of that training, but a greater --n-timesteps trains longer",
+    )
+    return parser
+
+
+def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, list[str]]:
+    """
+    :param arguments: Arguments of ``sb3-cchain train``
+    :return: What these options say, None where none is given; and the arguments for RL Zoo
+    :raises SystemExit: When an option is out of range, or the options do not go together
+    """
+    given, rest = make_parser().parse_known_args(arguments)
+    if given.checkpoint_freq is None and given.checkpoint_keep is None and given.resume is None:
+        return None, rest
+    others = argparse.ArgumentParser(add_help=False)
+    others.add_argument("-i", "--trained-agent", default="")
+    others.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    other, _ = others.parse_known_args(rest)
+    for name, least in (("checkpoint_freq", 1), ("checkpoint_keep", 1)):
+        value = getattr(given, name)
+        if value is not None and value < least:
+            sys.exit(f"--{name.replace('_', '-')} must be at least {least}; got {value}")
+    if given.checkpoint_freq is None and given.resume is None:
+        sys.exit("--checkpoint-keep says how many checkpoints stay: give --checkpoint-freq STEPS, too")
+    if other.optimize_hyperparameters:
+        sys.exit(f"{'--checkpoint-freq' if given.resume is None else '--resume'} does not go with -optimize")
+    if given.resume is not None and other.trained_agent:
+        sys.exit(
+            f"--resume and -i are both given, {given.resume} and {other.trained_agent}: --resume goes on exactly from a "
+            "checkpoint, -i goes on from a model alone"
+        )
+    return CheckpointOptions(given.checkpoint_freq, given.checkpoint_keep or KEEP, rest, given.resume), rest
+
+
+def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[CheckpointOptions, list[str]]:
+    """
+    :param options: The options
+    :param arguments: Arguments for RL Zoo
+    :return: With ``--resume``, the options with the checkpoint, and the arguments with its seed where none is given
+    :raises SystemExit: When there is no whole checkpoint
+    """
+    if options.resume is None:
+        return options, arguments
+    inside = options.resume / CHECKPOINTS
+    try:
+        checkpoint = find_checkpoint(inside if inside.is_dir() else options.resume)
+        record = read_record(checkpoint.folder)
+    except (ValueError, OSError) as error:
+        sys.exit(f"--resume: {error}")
+    seed = argparse.ArgumentParser(add_help=False)
+    seed.add_argument("--seed", type=int, default=-1)
+    if seed.parse_known_args(arguments)[0].seed < 0:  # RL Zoo would draw one
+        arguments = [*arguments, "--seed", str(record["options"]["seed"])]
+    return options._replace(freq=options.freq or record["checkpoint_freq"], checkpoint=checkpoint, record=record), arguments
+
+
+def write_record(
+    folder: Path, options: CheckpointOptions, args: argparse.Namespace, hyperparameters: Mapping[str, Any]
+) -> None:
+    """
+    Write beside the checkpoints what the training is started with, so that training that goes on can be compared with it.
+
+    :param folder: Folder of the checkpoints
+    :param options: The options
+    :param args: RL Zoo's
+    :param hyperparameters: As RL Zoo read them
+    """
+    record = {
+        "checkpoint_freq": options.freq,
+        "options": {name: plain(getattr(args, name)) for name in COMPARED},
+        "hyperparameters": plain(hyperparameters),
+    }
+    with write_safely(folder / COMMAND) as path:
+        path.write_text(json.dumps(record, indent=1) + "\n")
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """
+    :param folder: Folder of the checkpoints
+    :return: What :func:`write_record` wrote there
+    :raises ValueError: When there is no such file
+    """
+    try:
+        return json.loads((folder / COMMAND).read_text())
+    except FileNotFoundError:
+        raise ValueError(
+            f"the checkpoints in {folder} were not made by `sb3-cchain train`, which writes {COMMAND} beside them: go on in "
+            "Python, by sb3_cchain.checkpoint.resume()"
+        ) from None
+
+
+def differences(record: Mapping[str, Any], args: argparse.Namespace, hyperparameters: Mapping[str, Any]) -> list[str]:
+    """
+    :param record: What training was started with
+    :param args: RL Zoo's, of training that is to go on
+    :param hyperparameters: As RL Zoo read them, of training that is to go on. Their ``n_timesteps`` may differ
+    :return: What differs, in a few words each
+    """
+    found = []
+    for name in COMPARED:
+        before, now = record["options"][name], plain(getattr(args, name))
+        if before != now:
+            found.append(f"--{name.replace('_', '-')} {before}, not {now}")
+    before, now = record["hyperparameters"], plain(hyperparameters)
+    for name in sorted({*before, *now} - {"n_timesteps"}):
+        if before.get(name) != now.get(name):
+            found.append(f"{name} {before.get(name)}, not {now.get(name)}")
+    return found
+
+
+def plain(value: Any) -> Any:
+    """
+    :param value: An option or hyperparameters
+    :return: The same as JSON holds it; classes and functions by their names
+    """
+    return json.loads(json.dumps(value, default=lambda entry: getattr(entry, "__qualname__", str(entry))))

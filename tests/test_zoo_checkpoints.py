@@ -1,0 +1,241 @@
+"""Checkpoints of ``sb3-cchain train``, and training that goes on exactly from them."""
+
+import os
+import shlex
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_cchain import CChainPPO, DoubleDQN
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.checkpoint import saved_timesteps
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
+from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
+
+ENV = "Continual/CartPole-v1"
+NAME = "Continual-CartPole-v1"
+EVALUATION = ("--eval-freq", "48", "--eval-episodes", "2")
+CALLBACKS = "callback:['sb3_cchain.TaskSync', 'sb3_cchain.ContinualMetrics']"
+SHORT_DQN = (
+    *("-params", "learning_starts:20", "buffer_size:150", "train_freq:8", "policy_kwargs:dict(net_arch=[8])", CALLBACKS),
+)
+
+
+class Killed(BaseException):
+    """In the place of a signal that ends the process."""
+
+
+def train(folder, *arguments, n=192, algo="ppo_cchain", seed=("--seed", "0"), evaluation=EVALUATION, params=SHORT_PPO):
+    command(
+        *("train", "--algo", algo, "--env", ENV, "-f", folder / "logs", "-tb", folder / "tb", *FAST, *seed, "-n", n),
+        *(*evaluation, "--env-kwargs", "steps_per_task:64", "n_tasks:3", *arguments, *params),
+    )
+
+
+def run_folder(folder, number, algo="ppo_cchain"):
+    return folder / "logs" / algo / f"{NAME}_{number}"
+
+
+def returns_file(folder, number, cls=CChainPPO):
+    return folder / "tb" / NAME / f"{cls.__name__}_{number}" / "returns.csv"
+
+
+@pytest.fixture
+def at_step(monkeypatch):
+    """Does something at a step of training with checkpoints, once."""
+
+    def set_action(step, action):
+        def on_step(self):
+            if self.num_timesteps == step:
+                monkeypatch.setattr(TrainingCheckpoint, "_on_step", lambda self: True)
+                action()
+            return True
+
+        monkeypatch.setattr(TrainingCheckpoint, "_on_step", on_step)
+
+    return set_action
+
+
+def kill():
+    raise Killed
+
+
+def content(folder):
+    """Of all files in it."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_same_end(folder, one, other, cls=CChainPPO, algo="ppo_cchain"):
+    assert returns_file(folder, one, cls).read_bytes() == returns_file(folder, other, cls).read_bytes()
+    models = [cls.load(run_folder(folder, number, algo) / f"{NAME}.zip", device="cpu") for number in (one, other)]
+    assert models[0].num_timesteps == models[1].num_timesteps
+    for parameter, same in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.equal(parameter, same)
+    evaluations = [run_folder(folder, number, algo) / "evaluations.npz" for number in (one, other)]
+    assert evaluations[0].exists() == evaluations[1].exists()
+    if evaluations[0].exists():
+        first, second = (dict(np.load(path)) for path in evaluations)
+        assert first.keys() == second.keys() and all((first[name] == second[name]).all() for name in first)
+
+
+@pytest.mark.parametrize(
+    "algo, cls, options, params",
+    [
+        ("ppo_cchain", CChainPPO, ["--save-freq", "48"], [*SHORT_PPO, "normalize:True"]),
+        ("ppo_cchain", CChainPPO, ["--vec-env", "subproc"], SHORT_PPO),
+        ("double_dqn", DoubleDQN, [], SHORT_DQN),
+    ],
+    ids=["normalised", "subproc", "off-policy"],
+)
+def test_training_that_was_killed_goes_on_exactly(tmp_path, at_step, algo, cls, options, params):
+    arguments = dict(algo=algo, params=params)
+    train(tmp_path, *options, **arguments)
+    at_step(140, kill)
+    with pytest.raises(Killed):
+        train(tmp_path, *options, "--checkpoint-freq", 32, "--checkpoint-keep", 3, **arguments)
+    killed = run_folder(tmp_path, 2, algo)
+    folders = [path.name for path in sorted((killed / "checkpoints").glob("step_*"))]
+    assert len(folders) == 3 and not (killed / f"{NAME}.zip").exists()
+    before = content(killed)
+    # A random seed, if none is given, would be another training
+    train(tmp_path, *options, "--resume", killed, seed=(), **arguments)
+    assert_same_end(tmp_path, 1, 3, cls, algo)
+    assert content(killed) == before
+    resumed = run_folder(tmp_path, 3, algo)
+    assert (resumed / "resumed_from").read_text() == f"{killed / 'checkpoints' / folders[-1]}\n"
+    # As many and as often as before
+    assert len(list((resumed / "checkpoints").glob("step_*"))) >= 1
+    # Once more, from an older one, less often
+    train(tmp_path, *options, "--resume", killed / "checkpoints" / folders[0], "--checkpoint-freq", 1000, **arguments)
+    assert_same_end(tmp_path, 1, 4, cls, algo)
+    assert not list((run_folder(tmp_path, 4, algo) / "checkpoints").glob("step_*"))
+
+
+def test_the_best_model_and_evaluations_come_along(tmp_path):
+    train(tmp_path, "--checkpoint-freq", 32)
+    finished = run_folder(tmp_path, 1)
+    # Though the training is finished, one may go on from a checkpoint of it
+    train(tmp_path, "--resume", finished / "checkpoints" / "step_000000000160")
+    for name in ("evaluations.npz", "best_model.zip"):
+        assert (run_folder(tmp_path, 2) / name).exists()
+    steps = np.load(run_folder(tmp_path, 2) / "evaluations.npz")["timesteps"].tolist()
+    assert steps == [48, 96, 144, 192]
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_training_that_is_told_to_stop_says_how_to_go_on(tmp_path, at_step, capsys, number, code):
+    train(tmp_path, evaluation=NO_EVALUATION)
+    at_step(100, lambda: os.kill(os.getpid(), number))
+    with pytest.raises(SystemExit) as stopped:
+        train(tmp_path, "--checkpoint-freq", 1000, evaluation=NO_EVALUATION)
+    assert stopped.value.code == code
+    # The rollout is completed. On Ctrl-C RL Zoo saves the model, too
+    folder = run_folder(tmp_path, 2)
+    assert [path.name for path in (folder / "checkpoints").glob("step_*")] == ["step_000000000128"]
+    assert (folder / f"{NAME}.zip").exists() == (number == signal.SIGINT)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("sb3-cchain train")]
+    assert line.endswith(f"--resume {folder}")
+    command(*shlex.split(line)[1:])
+    assert_same_end(tmp_path, 1, 3)
+
+
+def test_a_finished_training_says_so_and_can_be_made_longer(tmp_path, capsys):
+    train(tmp_path, "--checkpoint-freq", 64, n=128, evaluation=NO_EVALUATION)
+    run = run_folder(tmp_path, 1)
+    with pytest.raises(SystemExit) as finished:
+        train(tmp_path, "--resume", run, n=128, evaluation=NO_EVALUATION)
+    assert finished.value.code == 0
+    assert f"The training in {run} is finished: it made 128 of 128 steps." in capsys.readouterr().out
+    assert not run_folder(tmp_path, 2).exists()
+    train(tmp_path, "--resume", run, n=192, evaluation=NO_EVALUATION)
+    assert saved_timesteps(run_folder(tmp_path, 2) / f"{NAME}.zip") == 192
+    rows = read_returns(returns_file(tmp_path, 2))
+    assert rows[: len(read_returns(returns_file(tmp_path, 1)))] == read_returns(returns_file(tmp_path, 1))
+    assert rows[-1]["timesteps"] == 192
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    """A run folder with checkpoints, of training that is not finished."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    train(folder, "--checkpoint-freq", 32, n=96, evaluation=NO_EVALUATION)
+    os.remove(run_folder(folder, 1) / f"{NAME}.zip")
+    return run_folder(folder, 1)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(seed=("--seed", "7")), r"had --seed 0, not 7\. Give the options that it had"),
+        (dict(algo="ppo"), r"had --algo ppo_cchain, not ppo; .*target_churn_ratio 10000.0, not None"),
+        (dict(params=(*SHORT_PPO, "gamma:0.5")), r"had gamma 0.99, not 0.5\. Give"),
+        (dict(params=(*SHORT_PPO[:-1], "policy_kwargs:dict(net_arch=[9])")), r"had policy_kwargs {'net_arch': \[8\]}, not "),
+        (dict(evaluation=EVALUATION), r"had --eval-freq -1, not 48; --eval-episodes 5, not 2"),
+    ],
+)
+def test_another_training_is_refused(checkpoints, tmp_path, changes, message):
+    with pytest.raises(SystemExit, match=f"--resume: the training in {checkpoints}.* {message}"):
+        train(tmp_path, "--resume", checkpoints, **{"evaluation": NO_EVALUATION, **changes})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["--checkpoint-freq", "0"], "--checkpoint-freq must be at least 1; got 0"),
+        (["--checkpoint-freq", "8", "--checkpoint-keep", "0"], "--checkpoint-keep must be at least 1; got 0"),
+        (["--checkpoint-keep", "2"], "give --checkpoint-freq STEPS, too"),
+        (["--checkpoint-freq", "8", "-optimize"], "--checkpoint-freq does not go with -optimize"),
+        (["--resume", "{}", "-optimize"], "--resume does not go with -optimize"),
+        (["--resume", "{}", "-i", "model.zip"], r"--resume and -i are both given, .* and model.zip: --resume goes on exactly"),
+        (["--resume", "nowhere"], "--resume: nowhere is not a checkpoint"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_before_any_work(checkpoints, tmp_path, options, message):
+    with pytest.raises(SystemExit, match=message):
+        train(tmp_path, *[option.format(checkpoints) for option in options])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoints_that_the_command_did_not_make(checkpoints, tmp_path):
+    shutil.copytree(checkpoints / "checkpoints", tmp_path / "own")
+    os.remove(tmp_path / "own" / "command.json")
+    with pytest.raises(SystemExit, match=r"were not made by `sb3-cchain train`.*: go on in Python, by sb3_cchain"):
+        train(tmp_path, "--resume", tmp_path / "own")
+
+
+def test_a_torn_checkpoint_is_passed_over(checkpoints, tmp_path):
+    shutil.copytree(checkpoints, tmp_path / "run")
+    torn = tmp_path / "run" / "checkpoints" / "step_000000000064" / "training.pkl"
+    torn.write_bytes(torn.read_bytes()[:100])
+    with pytest.warns(UserWarning, match=f"{torn.parent} is damaged: .* An older checkpoint is taken instead"):
+        train(tmp_path, "--resume", tmp_path / "run", n=96, evaluation=NO_EVALUATION)
+    assert (run_folder(tmp_path, 1) / "resumed_from").read_text().endswith("step_000000000032\n")
+    assert saved_timesteps(run_folder(tmp_path, 1) / f"{NAME}.zip") == 96
+
+
+def test_checkpoints_change_nothing(tmp_path):
+    train(tmp_path)
+    train(tmp_path, "--checkpoint-freq", 1)
+    assert_same_end(tmp_path, 1, 2)
+
+
+def test_help_lists_the_options(capsys):
+    with pytest.raises(SystemExit):
+        command("train", "--help")
+    shown = capsys.readouterr().out
+    for option in ("--checkpoint-freq STEPS", "--checkpoint-keep N", "--resume PATH", "--n-timesteps"):
+        assert option in shown
+
+
+def test_without_the_options_a_keyboard_interrupt_is_rl_zoos(tmp_path, monkeypatch):
+    def interrupted(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(BaseAlgorithm, "_setup_learn", interrupted)
+    train(tmp_path, evaluation=NO_EVALUATION)
+    assert (run_folder(tmp_path, 1) / f"{NAME}.zip").exists()
