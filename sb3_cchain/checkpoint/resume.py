@@ -46,8 +46,8 @@ def resume(
     remaining = (checkpoint.total_timesteps if total_timesteps is None else total_timesteps) - checkpoint.num_timesteps
     if remaining <= 0:
         raise ValueError(
-            f"`total_timesteps` must be more than {checkpoint.num_timesteps}, the steps that the model in {checkpoint.path} was "
-            f"trained for; got {total_timesteps or checkpoint.total_timesteps}"
+            f"`total_timesteps` must be more than {checkpoint.num_timesteps}, the steps that the model in {checkpoint.path} "
+            f"was trained for; got {total_timesteps or checkpoint.total_timesteps}"
         )
     model = load_model(checkpoint, env, device)
     if logger is None and model.tensorboard_log is not None and checkpoint.info["log_folder"] is not None:
