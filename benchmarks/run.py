@@ -8,6 +8,7 @@ folder for each run. The same command goes on where it was interrupted.
 """
 
 import argparse
+import signal
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -86,9 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with ended_by_sigterm(), backend:
             failures = complete(grid, args.results, args.logs, backend, console)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as stopped:
         console.print("Interrupted. The same command goes on.")
-        return 130
+        return 128 + (signal.SIGTERM if isinstance(stopped, SystemExit) else signal.SIGINT)
     console.print(f"{len(grid) - len(failures)} of {len(grid)} runs are done, {len(failures)} failed. Results: {args.results}")
     for failure in failures:
         console.print(str(failure), style="red", soft_wrap=True, highlight=False, markup=False)

@@ -212,8 +212,7 @@ class LocalBackend(Backend):
     def __exit__(self, *error: object) -> None:
         if self._running:
             print(
-                f"Stopping: {len(self._running)} runs save themselves, which takes up to {SECONDS_TO_STOP:.0f} seconds. "
-                "Ctrl-C again ends them at once",
+                f"Waiting for runs to save themselves, up to {SECONDS_TO_STOP:.0f} s. Ctrl-C again ends them at once",
                 flush=True,
             )
         stop_all([training for training, _ in self._running.values()])

@@ -72,7 +72,10 @@ class RayBackend(Backend):
     def __exit__(self, *error: object) -> None:
         try:
             if self._running:
-                print(f"Stopping: {len(self._running)} runs save themselves. Ctrl-C again ends them at once", flush=True)
+                print(
+                    f"Waiting for runs to save themselves, up to {SECONDS_TO_STOP:.0f} s. Ctrl-C again ends them at once",
+                    flush=True,
+                )
                 for reference in self._running:
                     self._ray.cancel(reference)
                 self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SECONDS_TO_STOP + 10)
