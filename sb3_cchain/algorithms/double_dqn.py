@@ -15,7 +15,9 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional as F
 
 from sb3_cchain.algorithms.off_policy import finite_td_loss
+from sb3_cchain.checkpoint import TrainingCheckpoint
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.validation import check_bool
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
@@ -156,6 +158,9 @@ class DoubleDQN(DQN):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert self.replay_buffer is not None
         n_transitions = self.replay_buffer.size() * self.n_envs
+        is_resumed = any(isinstance(found, TrainingCheckpoint) and found.is_resuming for found in iterate_callbacks(result[1]))
+        if is_resumed:  # it will put the replay buffer back
+            return result
         if self.num_timesteps > self.learning_starts and n_transitions < min(self.batch_size, self.num_timesteps):
             warnings.warn(
                 f"Training goes on at step {self.num_timesteps}, after `learning_starts={self.learning_starts}`, with "

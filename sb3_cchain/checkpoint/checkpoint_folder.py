@@ -83,9 +83,16 @@ class Checkpoint:
     def read_state(self) -> dict[str, Any]:
         """
         :return: What is not in the model's file. Unpickled, so a checkpoint must come from somebody you trust.
+        :raises ValueError: When it was made with other code, whose classes are not here
         """
-        with open(self.path / STATE, "rb") as file:
-            state: dict[str, Any] = pickle.load(file)
+        try:
+            with open(self.path / STATE, "rb") as file:
+                state: dict[str, Any] = pickle.load(file)
+        except (pickle.UnpicklingError, AttributeError, ImportError, TypeError, EOFError) as error:
+            made_with = self.info["versions"].get("sb3-cchain", "unknown")
+            raise ValueError(
+                f"{self.path / STATE} cannot be read ({error}): it was made with other code, sb3-cchain {made_with}"
+            ) from error
         return state
 
     def warn_of_other_versions(self) -> None:

@@ -36,6 +36,18 @@ def write_safely(path: str | Path) -> Iterator[Path]:
         unfinished.unlink(missing_ok=True)
 
 
+def sync_files(folder: Path) -> None:
+    """
+    Have what was written to the files in a folder on the disk.
+
+    :param folder: The folder; what is in folders in it is left out
+    """
+    for path in folder.iterdir():
+        if path.is_file():
+            with open(path, "rb") as file:
+                os.fsync(file.fileno())
+
+
 def sync_folder(folder: Path) -> None:
     """
     Have the names of the files in a folder on the disk.

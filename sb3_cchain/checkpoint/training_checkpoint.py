@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, package_versions
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
+from sb3_cchain.checkpoint.files import sync_files
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
 from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
 from sb3_cchain.tasks.callback_tree import require_single
@@ -92,6 +93,11 @@ class TrainingCheckpoint(BaseCallback):
         :param checkpoint: A checkpoint
         """
         self._resumed = checkpoint
+
+    @property
+    def is_resuming(self) -> bool:
+        """Whether the next or the present ``learn()`` goes on from a checkpoint, whose state has not been put back yet."""
+        return self._resumed is not None
 
     @property
     def seconds(self) -> float:
@@ -196,6 +202,8 @@ class TrainingCheckpoint(BaseCallback):
             "left_out": left_out,
             "chunks": chunk_names(state),
         }
+        if self.logger.dir is not None:
+            sync_files(Path(self.logger.dir))  # what comes before the checkpoint is not written again
         return self._folder.write(info, self.model.save, state)
 
     def _stop(self) -> None:
