@@ -40,9 +40,9 @@ def sync_files(folder: Path) -> None:
     """
     Have what was written to the files in a folder on the disk.
 
-    :param folder: The folder; what is in folders in it is left out
+    :param folder: The folder, which need not exist; what is in folders in it is left out
     """
-    for path in folder.iterdir():
+    for path in folder.glob("*"):
         if path.is_file():
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
