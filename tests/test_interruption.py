@@ -22,6 +22,7 @@ ARGUMENTS = {
     "ReDo": dict(tau=0.5, interval=1),
     "ShrinkAndPerturb": dict(shrink=0.5),
     "TaskLearningStarts": dict(learning_starts=4),
+    "TrainingCheckpoint": dict(save_freq=8, path="checkpoints"),
 }
 PUBLIC = {
     name: getattr(module, name)
@@ -74,7 +75,8 @@ def attached(model):
 @pytest.mark.parametrize("where", ["update", "step"])
 @pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
 @pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_training_without_the_callback_is_plain_training(tmp_path, name, algorithm, where):
+def test_training_without_the_callback_is_plain_training(tmp_path, monkeypatch, name, algorithm, where):
+    monkeypatch.chdir(tmp_path)
     settings = dict(normalize_advantage=False) if algorithm == "PPO" else {}
     model = make_model(algorithm, policy_kwargs=dict(net_arch=[8], optimizer_class=methods.L2Init), **settings)
     before = attached(model)

@@ -12,6 +12,7 @@ import pickle
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
@@ -190,6 +191,12 @@ class CheckpointFolder:
                 "resume(), give another path, or move them away."
             )
         later = [folder for folder in there if newest is not None and folder.name > step_name(newest)]
+        for folder in [folder for folder in later if _whole(folder) is None]:
+            # In place of which an older one was taken
+            aside = folder.with_name(f"damaged_{folder.name}")
+            shutil.rmtree(aside, ignore_errors=True)
+            os.rename(folder, aside)
+            later.remove(folder)
         if later:
             raise ValueError(
                 f"Training goes on from step {newest}, but `path` holds later checkpoints, the newest of which is {later[0]}. "
@@ -234,7 +241,11 @@ class CheckpointFolder:
             hidden = folder.with_name(f".{folder.name}")
             os.rename(folder, hidden)
             shutil.rmtree(hidden)
-        self.store.remove_all_but({name for folder in folders[: self.keep] for name in _read_info(folder)["chunks"]})
+        needed: set[str] = set()
+        for folder in folders[: self.keep]:
+            with suppress(ValueError):  # a damaged one, which is of no use any more
+                needed.update(_read_info(folder)["chunks"])
+        self.store.remove_all_but(needed)
 
     def close(self) -> None:
         """Let others write to it."""

@@ -228,13 +228,17 @@ class TrainingCheckpoint(BaseCallback):
             self._stop_signal = number
             print("Stopping when this rollout has been learned from and saved. Stop at once: Ctrl-C again", flush=True)
             return
-        self._release()
+        # Where the former handler lets training go on, it is still stopped after this rollout
+        self._restore_handlers()
         os.kill(os.getpid(), number)
 
-    def _release(self) -> None:
+    def _restore_handlers(self) -> None:
         for number, handler in self._replaced_handlers.items():
             signal.signal(number, handler)
         self._replaced_handlers = {}
+
+    def _release(self) -> None:
+        self._restore_handlers()
         if self._folder is not None:
             self._folder.close()
             self._folder = None

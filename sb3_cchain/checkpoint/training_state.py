@@ -115,7 +115,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     left_out: list[str] = []
     # Callbacks keep the arguments with which the present process made them, such as the files that they write
     skip = {
-        "model": _SKIPPED_OF_MODEL,
+        "model": _SKIPPED_OF_MODEL | _views(model),
         **{name: _SKIPPED_OF_CALLBACK | constructor_arguments(type(found)) for name, found in callbacks.items()},
     }
     buffer = getattr(model, "replay_buffer", None)
@@ -132,6 +132,17 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     for name, env_state in (state["envs"] or {}).items():
         left_out += [f"{name} {attribute}" for attribute in env_state["left_out"]]
     return state, left_out
+
+
+def _views(model: BaseAlgorithm) -> set[str]:
+    """Attributes that are lists of views of the policy's tensors, as SB3 keeps of the running statistics of BatchNorm."""
+    memory = {tensor.data_ptr() for tensor in model.policy.state_dict().values()}
+    lists = {name: value for name, value in vars(model).items() if isinstance(value, list) and value}
+    return {
+        name
+        for name, value in lists.items()
+        if all(isinstance(entry, th.Tensor) and entry.data_ptr() in memory for entry in value)
+    }
 
 
 def chunk_names(state: Mapping[str, Any]) -> list[str]:

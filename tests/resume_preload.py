@@ -1,0 +1,23 @@
+"""What the new processes of ``tests/resume_cases.py`` have imported, so that each of them does not take seconds for it."""
+
+import importlib
+from contextlib import suppress
+
+import tests.resume_cases  # noqa: F401
+
+SLOW = (
+    *(
+        "torch._dynamo",
+        "sb3_contrib",
+        "Box2D",
+        "minatar",
+        "procgen",
+        "dm_control.suite",
+        "shimmy",
+        "gymnasium.envs.classic_control",
+    ),
+    *("gymnasium.envs.box2d", "sb3_cchain.envs.minatar", "sb3_cchain.envs.dm_control", "sb3_cchain.envs.procgen"),
+)
+for name in SLOW:
+    with suppress(ImportError):
+        importlib.import_module(name)

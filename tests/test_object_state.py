@@ -1,0 +1,338 @@
+"""The state of objects is put back into objects that were made in the same way."""
+
+import io
+import pickle
+import random
+import sys
+import threading
+from collections import OrderedDict, defaultdict, deque
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_cchain.checkpoint.object_state import (
+    Known,
+    NotSaved,
+    object_state,
+    object_states,
+    register_copy,
+    register_state,
+    restore_object,
+    restore_objects,
+)
+
+
+class Thing:
+    """With the attributes that it is given."""
+
+    def __init__(self, **attributes):
+        vars(self).update(attributes)
+
+
+class Counter:
+    """Knows its state."""
+
+    def __init__(self, count=0):
+        self.count, self.derived = count, count + 1
+
+    def state_dict(self):
+        return {"count": self.count}
+
+    def load_state_dict(self, state):
+        self.count = state["count"]
+        self.derived = self.count + 1
+
+
+class Foreign:
+    """Passes for an object of another package."""
+
+
+Foreign.__module__ = "elsewhere"
+
+
+def saved(holder, *args, **kwargs):
+    """As it would be read from a file."""
+    return pickle.loads(pickle.dumps(object_state(holder, *args, **kwargs)))
+
+
+def test_plain_data():
+    values = dict(
+        number=3,
+        text="a",
+        array=np.arange(3.0),
+        tensor=th.arange(3),
+        nothing=None,
+        nested={"a": [1, (2, {3})]},
+        queue=deque([1, 2], maxlen=2),
+        default=defaultdict(list, {1: [2]}),
+        ordered=OrderedDict(b=1, a=2),
+    )
+    thing = Thing(**{name: None for name in values}, other="stays")
+    restore_object(thing, saved(Thing(**values)))
+    assert thing.other == "stays"
+    assert th.equal(thing.tensor, values["tensor"]) and np.array_equal(thing.array, values["array"])
+    for name in values.keys() - {"tensor", "array"}:
+        found = getattr(thing, name)
+        assert found == values[name] and type(found) is type(values[name])
+    assert thing.queue.maxlen == 2
+
+
+def test_a_state_does_not_change_any_more():
+    thing = Thing(array=np.zeros(2), tensor=th.zeros(2), list=[1])
+    state = object_state(thing)
+    thing.array += 1
+    thing.tensor += 1
+    thing.list.append(2)
+    restore_object(thing, state)
+    assert thing.list == [1] and not thing.array.any() and not thing.tensor.any()
+
+
+def test_objects_stay_the_objects_that_they_are():
+    """So hooks and closures go on referring to them."""
+    live = Thing(inner=Thing(deep=Thing(value=0)))
+    inner, deep = live.inner, live.inner.deep
+    restore_object(live, saved(Thing(inner=Thing(deep=Thing(value=7)))))
+    assert live.inner is inner and live.inner.deep is deep and deep.value == 7
+
+
+@pytest.mark.parametrize("live", [None, 3, Foreign()])
+def test_an_object_that_is_not_there_is_made(live):
+    thing = Thing(inner=live)
+    restore_object(thing, saved(Thing(inner=Thing(value=7, deep=Thing(value=8)))))
+    assert type(thing.inner) is Thing and thing.inner.value == 7 and thing.inner.deep.value == 8
+
+
+def test_an_attribute_that_is_not_there_is_made():
+    thing = Thing()
+    restore_object(thing, saved(Thing(inner=Thing(value=7), number=3)))
+    assert thing.inner.value == 7 and thing.number == 3
+
+
+def test_an_object_that_became_none():
+    thing = Thing(inner=Thing())
+    restore_object(thing, saved(Thing(inner=None)))
+    assert thing.inner is None
+
+
+def test_what_two_attributes_share_is_shared_afterwards():
+    array, inner = np.zeros(2), Thing(value=1)
+    source = Thing(first=array, second=array, one=inner, other=inner, own=np.zeros(2))
+    live = Thing(first=np.ones(2), second=np.ones(2), one=Thing(value=0), other=Thing(value=0), own=None)
+    restore_object(live, saved(source))
+    assert live.first is live.second and live.one is live.other and live.own is not live.first
+    live.first[0] = 5
+    assert live.second[0] == 5
+
+
+def test_what_two_holders_share_is_shared_afterwards():
+    def make(value):
+        shared = {"task": value}
+        return {"model": Thing(state=shared), "callback": Thing(state=shared, inner=Thing(value=value))}
+
+    states = pickle.loads(pickle.dumps(object_states(make(3))))
+    live = {"model": Thing(state={}), "callback": Thing(state={}, inner=Thing(value=0))}
+    restore_objects(live, states)
+    assert live["model"].state is live["callback"].state and live["model"].state == {"task": 3}
+
+
+def test_holders_refer_to_each_other():
+    def make(value):
+        model, callback = Thing(value=value), Thing(value=value)
+        model.callback, callback.model = callback, model
+        return {"model": model, "callback": callback}
+
+    live = make(0)
+    restore_objects(live, pickle.loads(pickle.dumps(object_states(make(3)))))
+    model, callback = live["model"], live["callback"]
+    assert model.callback is callback and callback.model is model and model.value == callback.value == 3
+
+
+def test_cycles():
+    def make(value):
+        outer = Thing(value=value, inner=Thing(value=value))
+        outer.inner.outer = outer
+        outer.inner.itself = outer.inner
+        return outer
+
+    live = make(0)
+    outer, inner = live, live.inner
+    restore_object(live, saved(make(3)))
+    assert live.inner is inner and inner.outer is outer and inner.itself is inner and inner.value == 3
+
+
+def test_known_objects_are_those_of_this_process():
+    model, other = Thing(value=1), Thing(value=2)
+    state = saved(Thing(model=model, among=[model, {"it": model}]), {"model": model})
+    assert state.values["model"] == Known("model")
+    live = Thing(model=None, among=None)
+    restore_object(live, state, {"model": other})
+    assert live.model is other and live.among[0] is other and live.among[1]["it"] is other and other.value == 2
+
+
+@pytest.mark.parametrize(
+    "make", [np.random.default_rng, np.random.RandomState, random.Random], ids=["Generator", "RandomState", "Random"]
+)
+def test_generators_stay_the_objects_that_they_are(make):
+    source, live = Thing(rng=make(1)), Thing(rng=make(2))
+    source.rng.random() if make is random.Random else source.rng.normal()
+    state = saved(source)
+    held = live.rng
+    restore_object(live, state)
+    draw = "gauss" if make is random.Random else "normal"
+    assert live.rng is held and getattr(held, draw)(0, 1) == getattr(source.rng, draw)(0, 1)
+
+
+def test_one_generator_of_two():
+    rng = np.random.default_rng(3)
+    live = Thing(first=np.random.default_rng(0), second=None)
+    restore_object(live, saved(Thing(first=rng, second=rng)))
+    assert live.first is live.second and live.first.normal() == rng.normal()
+
+
+def test_tensors_keep_no_more_than_they_show():
+    big = th.zeros(10_000)
+    state = object_state(Thing(view=big[:2]))
+    assert len(pickle.dumps(state)) < 2000
+    live = Thing(view=None)
+    restore_object(live, state)
+    assert live.view.tolist() == [0, 0]
+
+
+def test_tensors_of_a_graph_and_their_gradients():
+    leaf = th.ones(2, requires_grad=True)
+    live = Thing(leaf=None, result=None)
+    restore_object(live, saved(Thing(leaf=leaf, result=leaf * 2)))
+    assert live.leaf.requires_grad and not live.result.requires_grad and live.result.tolist() == [2, 2]
+
+
+def test_an_object_that_knows_its_state():
+    live = Thing(counter=Counter(), again=None)
+    counter = live.counter
+    source = Counter(5)
+    restore_object(live, saved(Thing(counter=source, again=source)))
+    assert live.counter is counter is live.again and (counter.count, counter.derived) == (5, 6)
+
+
+def test_a_holder_that_knows_its_state():
+    counter = Counter()
+    restore_object(counter, saved(Counter(5)))
+    assert (counter.count, counter.derived) == (5, 6)
+
+
+def test_modules_and_optimisers():
+    def make(seed):
+        th.manual_seed(seed)
+        net = th.nn.Linear(2, 2)
+        optimizer = th.optim.Adam(net.parameters())
+        net(th.ones(1, 2)).sum().backward()
+        optimizer.step()
+        return Thing(net=net, optimizer=optimizer)
+
+    source, live = make(1), make(2)
+    weight = live.net.weight
+    restore_object(live, saved(source, strict=True))
+    assert live.net.weight is weight and th.equal(weight, source.net.weight)
+    assert live.optimizer.param_groups[0]["params"][0] is weight
+    assert th.equal(live.optimizer.state[weight]["exp_avg"], source.optimizer.state[source.net.weight]["exp_avg"])
+
+
+class Closed:
+    """Code that cannot have ``state_dict()``, and cannot be pickled."""
+
+    def __init__(self, value):
+        self.value, self.lock = value, threading.Lock()
+
+
+def test_types_whose_state_is_registered():
+    register_state(Closed, lambda it: it.value, lambda it, value: setattr(it, "value", value))
+    live = Thing(closed=Closed(0))
+    closed = live.closed
+    restore_object(live, saved(Thing(closed=Closed(5)), strict=True))
+    assert live.closed is closed and closed.value == 5
+
+
+def test_types_whose_copying_is_registered():
+    register_copy(Foreign, lambda old, new: vars(old).update(vars(new)))
+    sys.modules.setdefault("elsewhere", sys.modules[__name__])
+    live, source = Thing(foreign=Foreign()), Thing(foreign=Foreign())
+    source.foreign.value = 5
+    foreign = live.foreign
+    restore_object(live, saved(source))
+    assert live.foreign is foreign and foreign.value == 5
+
+
+class Other:
+    """Of another package, and no more than attributes."""
+
+    def __init__(self, value):
+        self.value = value
+
+
+Other.__module__ = "some_package"
+
+
+def test_of_other_packages_only_data_is_saved():
+    left_out = []
+    holders = {"callback": Thing(other=Other(1), inner=Thing(other=Other(1), number=1))}
+    states = object_states(holders, left_out=left_out)
+    assert left_out == ["callback.other", "callback.inner.other"]
+    live = {"callback": Thing(other=(other := Other(0)), inner=Thing(other=Other(0), number=0))}
+    restore_objects(live, states)
+    assert live["callback"].other is other and other.value == 0 and live["callback"].inner.number == 1
+
+
+def test_all_is_saved_where_it_has_to_be():
+    live = Thing(other=Other(0))
+    other = live.other
+    restore_object(live, saved(Thing(other=Other(1)), strict=True))
+    assert live.other is other and other.value == 1
+
+
+def test_what_cannot_be_saved_is_named():
+    with pytest.raises(NotSaved, match=r"^env\.inner\.lock: cannot pickle"):
+        object_states({"env": Thing(inner=Thing(lock=threading.Lock()))}, strict=True)
+    left_out = []
+    states = object_states({"env": Thing(inner=Thing(lock=threading.Lock()))}, left_out=left_out)
+    assert left_out == ["env.inner.lock"] and states["env"].values["inner"].values == {}
+
+
+def test_what_belongs_to_the_process_stays(tmp_path):
+    file = open(tmp_path / "file", "w")
+    source = Thing(file=file, path=tmp_path, function=lambda: 1, kind=int, module=sys, stream=io.StringIO())
+    live = Thing(file="mine", path="mine", function="mine", kind="mine", module="mine", stream="mine")
+    restore_object(live, saved(source, strict=True))
+    assert set(vars(live).values()) == {"mine"}
+    file.close()
+
+
+def test_a_path_of_this_process_stays(tmp_path):
+    live = Thing(path=tmp_path)
+    restore_object(live, saved(Thing(path=None)))
+    assert live.path == tmp_path
+
+
+def test_skipped_attributes():
+    live = Thing(kept=0, skipped=0, inner=Thing(skipped=0))
+    restore_object(live, saved(Thing(kept=1, skipped=1, inner=Thing(skipped=1)), skip={"skipped"}))
+    assert (live.kept, live.skipped, live.inner.skipped) == (1, 0, 1)
+
+
+def test_of_spaces_the_random_numbers_alone():
+    source = Thing(space=spaces.Dict(a=spaces.Discrete(1000, seed=1), b=spaces.Box(-1, 1, (3,), seed=2)))
+    source.space.seed(3)
+    live = Thing(space=spaces.Dict(a=spaces.Discrete(1000, seed=5), b=spaces.Box(-1, 1, (3,), seed=6)))
+    space = live.space
+    restore_object(live, saved(source))
+    assert live.space is space
+    expected, found = source.space.sample(), space.sample()
+    assert expected["a"] == found["a"] and np.array_equal(expected["b"], found["b"])
+
+
+def test_an_object_that_appears_twice_with_its_own_state_is_restored_once():
+    source, live = Counter(3), Counter()
+    states = object_states({"one": Thing(it=source), "two": Thing(it=source)})
+    holders = {"one": Thing(it=live), "two": Thing(it=None)}
+    restore_objects(holders, states)
+    assert holders["two"].it is live and live.count == 3

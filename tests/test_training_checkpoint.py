@@ -1,0 +1,703 @@
+"""Files and errors of TrainingCheckpoint, and what its signals do. That training goes on exactly is in ``test_resume.py``."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import torch as th
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_cchain import CChainCallback, ChurnMonitor, TrainingCheckpoint, resume
+from sb3_cchain.checkpoint import ResumableEnv, find_checkpoint, load_model
+from sb3_cchain.checkpoint.checkpoint_folder import CheckpointFolder
+from tests.resume_cases import Stop, Stopped, in_new_process
+
+ARGUMENTS = dict(n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu")
+DQN_ARGUMENTS = dict(
+    learning_starts=10, buffer_size=6000, batch_size=8, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu"
+)
+# Two checkpoints stay, of which this is the newest
+STEPS, NEWEST, BEFORE = 160, 96, 64
+
+
+def make_env(env_id="CartPole-v1", n_envs=1, **kwargs):
+    return make_vec_env(env_id, n_envs, seed=0, **kwargs)
+
+
+def make(env=None, **kwargs):
+    return PPO("MlpPolicy", env or make_env(), **{**ARGUMENTS, **kwargs})
+
+
+def make_dqn(env=None):
+    return DQN("MlpPolicy", env or make_env(), **DQN_ARGUMENTS)
+
+
+def train(model, path, *callbacks, stop=110, save_freq=32, **kwargs):
+    """Until a step in which an error ends it."""
+    checkpoint = TrainingCheckpoint(save_freq, path, **kwargs)
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [checkpoint, *callbacks, Stop(stop)])
+    checkpoint._release()  # as the end of the process does
+    return checkpoint
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    th.set_num_threads(1)
+    path = tmp_path_factory.mktemp("trained")
+    train(make(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained_dqn(tmp_path_factory):
+    th.set_num_threads(1)
+    path = tmp_path_factory.mktemp("trained_dqn")
+    train(make_dqn(), path)
+    return path
+
+
+@pytest.fixture
+def path(trained, tmp_path):
+    """A folder of checkpoints that may be changed."""
+    return Path(shutil.copytree(trained, tmp_path / "checkpoints"))
+
+
+@pytest.fixture
+def dqn_path(trained_dqn, tmp_path):
+    return Path(shutil.copytree(trained_dqn, tmp_path / "checkpoints"))
+
+
+def names(path):
+    return sorted(folder.name for folder in path.glob("step_*"))
+
+
+def step(path, number):
+    return path / f"step_{number:012d}"
+
+
+def go_on(path, *callbacks, env=None, **kwargs):
+    folder = path if (path / ".lock").exists() else path.parent
+    given = [TrainingCheckpoint(32, folder), *callbacks, Stop(float("inf"))]
+    return resume(path, env or make_env(), given, device="cpu", **kwargs)
+
+
+def parameters(model):
+    return [parameter.detach().clone() for parameter in model.policy.parameters()]
+
+
+def assert_same(model, other):
+    assert all(th.equal(one, two) for one, two in zip(parameters(model), parameters(other), strict=True))
+
+
+# --- Files ---------------------------------------------------------------------------------------------------------------
+
+
+def test_files(trained):
+    assert names(trained) == [f"step_{BEFORE:012d}", f"step_{NEWEST:012d}"]
+    assert {file.name for file in step(trained, NEWEST).iterdir()} == {"checkpoint.json", "model.zip", "training.pkl"}
+    assert {file.name for file in trained.iterdir()} == {*names(trained), ".lock"}
+
+
+@pytest.mark.parametrize("keep", [1, 3, 100])
+def test_keep(tmp_path, keep):
+    train(make(), tmp_path, keep=keep, save_freq=16)
+    assert len(names(tmp_path)) == min(keep, 6) and names(tmp_path)[-1] == f"step_{NEWEST:012d}"
+
+
+def test_save_freq_counts_steps_of_all_environments(tmp_path):
+    train(make(make_env(n_envs=2)), tmp_path, save_freq=40, keep=9)
+    assert names(tmp_path) == [f"step_{64:012d}"]
+
+
+def test_the_checkpoint(trained):
+    checkpoint = find_checkpoint(trained)
+    assert checkpoint.path == step(trained, NEWEST)
+    assert (checkpoint.num_timesteps, checkpoint.total_timesteps) == (NEWEST, STEPS)
+    assert 0 < checkpoint.seconds < 100
+    assert {"versions", "environment", "model", "callbacks", "left_out", "learn"} <= checkpoint.info.keys()
+    assert find_checkpoint(step(trained, BEFORE)).num_timesteps == BEFORE
+
+
+def test_the_model_is_one_of_stable_baselines3(trained):
+    model = PPO.load(step(trained, NEWEST) / "model.zip", env=make_env(), device="cpu")
+    assert model.num_timesteps == NEWEST
+    model.learn(32)
+
+
+def test_training_with_it_is_training_without_it(tmp_path):
+    for create in (make, make_dqn):
+        models = []
+        for callbacks in ([], [TrainingCheckpoint(16, tmp_path / create.__name__)]):
+            models.append(create().learn(STEPS, callbacks))
+        assert_same(*models)
+
+
+def test_training_goes_on_to_the_end(path):
+    model = go_on(path)
+    assert model.num_timesteps == STEPS
+    assert names(path) == [f"step_{number:012d}" for number in (NEWEST, 128)]
+    assert_same(model, make().learn(STEPS))
+
+
+def test_an_older_checkpoint_in_another_folder(path, tmp_path):
+    checkpoint = find_checkpoint(step(path, BEFORE))
+    model = load_model(checkpoint, make_env(), "cpu")
+    callback = TrainingCheckpoint.resume_from(checkpoint, tmp_path / "others")
+    assert (callback.save_freq, callback.keep, callback.exact) == (32, 2, True)
+    model.learn(STEPS - BEFORE, [callback, Stop(float("inf"))], reset_num_timesteps=False)
+    assert_same(model, make().learn(STEPS))
+    assert names(tmp_path / "others") == [f"step_{number:012d}" for number in (96, 128)]
+    assert names(path) == [f"step_{number:012d}" for number in (BEFORE, NEWEST)]
+
+
+def test_more_steps_than_before(path):
+    assert go_on(path, total_timesteps=STEPS + 64).num_timesteps == STEPS + 64
+
+
+def test_seconds_go_on(path):
+    change_info(step(path, NEWEST), seconds=5000.0)
+    go_on(path)
+    assert 5000 < find_checkpoint(path).seconds < 5100
+
+
+def test_what_was_not_saved_is_named(tmp_path):
+    class Holder(BaseCallback):
+        def __init__(self):
+            super().__init__()
+            self.process_of_another_package = subprocess.Popen([sys.executable, "-c", ""])
+
+        def _on_step(self):
+            return True
+
+    train(make(), tmp_path, Holder())
+    assert "callback 1.process_of_another_package" in find_checkpoint(tmp_path).info["left_out"]
+
+
+def test_a_checkpoint_that_cannot_be_written(tmp_path, monkeypatch, handlers):
+    """An error, which leaves the checkpoints that are there."""
+    rename, model = os.rename, make()
+
+    def full(source, target):
+        if Path(target).name == f"step_{NEWEST:012d}":
+            raise OSError("No space left on device")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", full)
+    with pytest.raises(OSError, match="No space left"):
+        model.learn(STEPS, TrainingCheckpoint(32, tmp_path))
+    monkeypatch.undo()
+    assert find_checkpoint(tmp_path).num_timesteps == BEFORE and len(names(tmp_path)) == 2
+    assert_same(resume(tmp_path, make_env(), device="cpu"), make().learn(STEPS))
+
+
+def test_the_log_goes_on_in_its_folder(tmp_path):
+    pytest.importorskip("tensorboard")
+    model = make(tensorboard_log=str(tmp_path / "logs"))
+    train(model, tmp_path / "checkpoints")
+    resumed = go_on(tmp_path / "checkpoints")
+    assert resumed.logger.dir == model.logger.dir
+    assert [folder.name for folder in (tmp_path / "logs").iterdir()] == ["PPO_1"]
+    assert len(list((tmp_path / "logs" / "PPO_1").iterdir())) == 2
+
+
+# --- Folders of others ---------------------------------------------------------------------------------------------------
+
+
+def test_checkpoints_of_another_training_stay(path):
+    before = names(path)
+    with pytest.raises(ValueError, match=rf"`path` holds checkpoints of another training .*step_0*{NEWEST}"):
+        make().learn(STEPS, TrainingCheckpoint(32, path))
+    assert names(path) == before
+
+
+def test_later_checkpoints_stay(path):
+    before = names(path)
+    with pytest.raises(ValueError, match=rf"goes on from step {BEFORE}, .* later checkpoints, .*step_0*{NEWEST}"):
+        go_on(step(path, BEFORE))
+    assert names(path) == before
+
+
+def test_what_a_killed_process_left_is_removed(path):
+    (path / ".step_000000000128").mkdir()
+    (path / ".step_000000000128" / "model.zip").write_bytes(b"half")
+    go_on(path)
+    assert not list(path.glob(".step_*"))
+
+
+def write_to(path):
+    """For another process."""
+    try:
+        CheckpointFolder(path, 2, NEWEST).close()
+    except ValueError as error:
+        return str(error)
+    return "free"
+
+
+def test_one_process_at_a_time(path):
+    folder = CheckpointFolder(path, 2, NEWEST)
+    assert in_new_process(write_to, path).startswith(f"Another process is writing checkpoints to {path}")
+    folder.close()
+    assert in_new_process(write_to, path) == "free"
+
+
+def test_after_an_error_the_same_process_may_train_again(path, tmp_path):
+    """In a notebook, say."""
+    model = make()
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [TrainingCheckpoint(32, tmp_path / "new"), Stop(110)])
+    assert go_on(tmp_path / "new").num_timesteps == STEPS
+
+
+# --- Damage --------------------------------------------------------------------------------------------------------------
+
+
+def damage(file, kind):
+    content = bytearray(file.read_bytes())
+    if kind == "missing":
+        file.unlink()
+    elif kind == "torn":
+        file.write_bytes(content[: len(content) // 2])
+    elif kind == "empty":
+        file.write_bytes(b"")
+    else:
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "name, kind",
+    [
+        *((name, kind) for name in ("model.zip", "training.pkl") for kind in ("missing", "torn", "empty", "flipped")),
+        *(("checkpoint.json", kind) for kind in ("missing", "torn", "empty")),
+    ],
+)
+def test_a_damaged_checkpoint(path, name, kind):
+    damage(step(path, NEWEST) / name, kind)
+    with pytest.raises(ValueError, match=rf"{name}.*The newest whole checkpoint beside it is \S*step_0*{BEFORE}"):
+        find_checkpoint(step(path, NEWEST))
+    with pytest.warns(UserWarning, match=rf"{name}.*An older checkpoint is taken instead"):
+        assert find_checkpoint(path).num_timesteps == BEFORE
+    damage(step(path, BEFORE) / name, kind)
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="holds no whole checkpoint"):
+        find_checkpoint(path)
+    with pytest.raises(ValueError, match=name) as raised:
+        find_checkpoint(step(path, NEWEST))
+    assert "beside it" not in str(raised.value)
+
+
+@pytest.mark.filterwarnings("ignore:.*An older checkpoint is taken instead")
+def test_training_goes_on_from_the_one_before_a_damaged_one(path):
+    """Which does not stand in the way of new checkpoints, and is put aside."""
+    damage(step(path, NEWEST) / "training.pkl", "torn")
+    model = go_on(path)
+    assert_same(model, make().learn(STEPS))
+    assert names(path) == [f"step_{number:012d}" for number in (NEWEST, 128)]
+    assert find_checkpoint(step(path, NEWEST)).num_timesteps == NEWEST
+    assert [folder.name for folder in path.glob("damaged*")] == [f"damaged_step_{NEWEST:012d}"]
+
+
+@pytest.mark.parametrize("kind", ["missing", "torn"])
+def test_an_older_damaged_one_does_not_stop_training(dqn_path, kind):
+    damage(min(dqn_path.glob("step_*")) / "checkpoint.json", kind)
+    callback = TrainingCheckpoint(16, dqn_path, keep=5)
+    resume(dqn_path, make_env(), [callback, Stop(float("inf"))], device="cpu")
+    assert find_checkpoint(dqn_path).num_timesteps >= STEPS - 24
+
+
+def test_the_replay_buffer_is_in_pieces(dqn_path):
+    info = find_checkpoint(dqn_path).info
+    assert info["chunks"]
+    assert {file.stem for file in (dqn_path / "chunks").rglob("*.z")} >= set(info["chunks"])
+
+
+@pytest.mark.parametrize("kind", ["missing", "torn", "flipped"])
+def test_a_damaged_piece(dqn_path, kind):
+    checkpoint = find_checkpoint(dqn_path)
+    other = set(find_checkpoint(min(dqn_path.glob("step_*"))).info["chunks"])
+    piece = next(name for name in checkpoint.info["chunks"] if name not in other)
+    damage(next((dqn_path / "chunks").rglob(f"{piece}.z")), kind)
+    with pytest.raises(ValueError, match=rf"{piece if kind != 'missing' else 'chunks'}"):
+        go_on(checkpoint.path)
+    if kind == "missing":
+        with pytest.warns(UserWarning, match="An older checkpoint is taken instead"):
+            assert find_checkpoint(dqn_path).num_timesteps < checkpoint.num_timesteps
+
+
+def test_something_else_is_no_checkpoint(tmp_path):
+    (tmp_path / "file").write_text("text")
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "file", tmp_path / "empty", tmp_path / "missing"):
+        with pytest.raises(ValueError, match=f"{path} is not a checkpoint of a training"):
+            find_checkpoint(path)
+        with pytest.raises(ValueError, match=f"{path} is not a checkpoint of a training"):
+            go_on(path)
+
+
+def change_info(folder, **changes):
+    file = folder / "checkpoint.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def test_another_format(path):
+    change_info(step(path, NEWEST), format=2)
+    with pytest.raises(ValueError, match=r"has the format 2 of sb3-cchain \S+; this version reads the format 1"):
+        find_checkpoint(step(path, NEWEST))
+
+
+def test_other_versions(path):
+    versions = find_checkpoint(path).info["versions"]
+    change_info(step(path, NEWEST), versions={**versions, "torch": "1.0", "sb3-contrib": "0.1"})
+    with pytest.warns(UserWarning, match=r"was made with .*torch 1\.0 \(now \S+\).* not exactly"):
+        assert go_on(path).num_timesteps == STEPS
+
+
+# --- Another training than the one that was saved ------------------------------------------------------------------------
+
+
+class Changed(gym.Wrapper):
+    """Another environment by its wrappers."""
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(n_envs=2), "number of environments was 1 and is 2"),
+        (dict(wrapper_class=Changed), "environment was <.*> and is <Changed<"),
+    ],
+    ids=["number", "wrappers"],
+)
+def test_another_environment(path, kwargs, message):
+    before = names(path)
+    with pytest.raises(ValueError, match=f"differs from this one: {message}.*Make the training as it was"):
+        go_on(path, env=make_env(**kwargs))
+    assert names(path) == before
+
+
+def test_an_environment_that_is_normalised(path):
+    with pytest.raises(ValueError, match="vectorised wrappers was none and is VecNormalize"):
+        go_on(path, env=VecNormalize(make_env()))
+
+
+def test_an_environment_of_other_spaces(path):
+    with pytest.raises(ValueError, match="spaces do not match"):
+        go_on(path, env=make_env("Acrobot-v1"))
+
+
+def test_other_hyperparameters(path):
+    checkpoint = find_checkpoint(path)
+    model = PPO.load(checkpoint.model_path, env=make_env(), device="cpu", learning_rate=1e-4, gamma=0.5)
+    callbacks = [TrainingCheckpoint.resume_from(checkpoint), Stop(float("inf"))]
+    before = parameters(model)
+    with pytest.raises(ValueError, match=r"gamma was 0\.99 and is 0\.5; learning_rate was 0\.0003 and is 0\.0001"):
+        model.learn(64, callbacks, reset_num_timesteps=False)
+    assert all(map(th.equal, before, parameters(model)))
+
+
+def test_other_callbacks(path):
+    with pytest.raises(ValueError, match=r"callback 1 was Stop and is ChurnMonitor.*same callbacks in the same order"):
+        resume(path, make_env(), [TrainingCheckpoint(32, path), ChurnMonitor()], device="cpu")
+    with pytest.raises(ValueError, match=r"callback 1 was Stop and is absent"):
+        resume(path, make_env(), device="cpu")
+    with pytest.raises(ValueError, match=r"callback 0 was TrainingCheckpoint and is Stop"):
+        resume(path, make_env(), [Stop(1), TrainingCheckpoint(32, path)], device="cpu")
+
+
+def test_a_finished_training(path):
+    for folder in (BEFORE, NEWEST):
+        change_info(step(path, folder), total_timesteps=NEWEST)
+    with pytest.raises(ValueError, match=rf"`total_timesteps` must be more than {NEWEST}, .*; got {NEWEST}"):
+        go_on(path)
+    with pytest.raises(ValueError, match=rf"`total_timesteps` must be more than {NEWEST}, .*; got 50"):
+        go_on(path, total_timesteps=50)
+    assert go_on(path, total_timesteps=STEPS).num_timesteps == STEPS
+
+
+# --- Arguments -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(save_freq=0), "`save_freq` must be .*got 0"),
+        (dict(save_freq=1.5), "`save_freq` must be .*got 1.5"),
+        (dict(keep=0), "`keep` must be .*got 0"),
+        (dict(exact="yes"), "`exact` must be .*got 'yes'"),
+    ],
+)
+def test_wrong_arguments(tmp_path, arguments, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        TrainingCheckpoint(**{"save_freq": 10, "path": tmp_path, **arguments})
+
+
+def test_two_of_them(tmp_path):
+    with pytest.raises(ValueError, match="2 callbacks TrainingCheckpoint"):
+        make().learn(STEPS, [TrainingCheckpoint(16, tmp_path / "a"), TrainingCheckpoint(16, tmp_path / "b")])
+
+
+def test_environments_in_processes_need_a_wrapper(tmp_path, handlers):
+    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
+    model = make(env)
+    before = parameters(model)
+    with pytest.raises(ValueError, match="ResumableEnv"):
+        model.learn(STEPS, TrainingCheckpoint(16, tmp_path))
+    assert model.num_timesteps == 0 and all(map(th.equal, before, parameters(model)))
+    # Nothing is left of it: neither files nor handlers
+    assert names(tmp_path) == [] and handlers[1]()
+    train(model, tmp_path, exact=False)
+    assert names(tmp_path)[-1] == f"step_{NEWEST:012d}"
+    env.close()
+
+
+def test_new_episodes_where_exactness_is_not_wanted(tmp_path):
+    train(make(), tmp_path, exact=False)
+    env = make_env()
+    episodes = []
+
+    class Watch(Stop):
+        def _on_rollout_start(self):
+            episodes.append(env.envs[0].unwrapped.state.copy())
+            episodes.append(self.model._last_obs[0].copy())
+
+    Watch.__name__ = "Stop"
+    given = [TrainingCheckpoint(32, tmp_path, exact=False), Watch(float("inf"))]
+    with pytest.warns(UserWarning, match="begin new episodes"):
+        model = resume(tmp_path, env, given, device="cpu")
+    # The environment and the model agree on where the episode is, and all environments are at their beginning
+    assert abs(episodes[0] - episodes[1]).max() < 1e-6 and abs(episodes[0]).max() <= 0.05
+    assert model.num_timesteps == STEPS
+    assert find_checkpoint(tmp_path).info["training_checkpoint"]["exact"] is False
+
+
+# --- Signals -------------------------------------------------------------------------------------------------------------
+
+
+class Send(BaseCallback):
+    """Signals to this process, each at a step."""
+
+    def __init__(self, *signals):
+        super().__init__()
+        self.left = list(signals)
+
+    def _on_step(self):
+        while self.left and self.num_timesteps >= self.left[0][0]:
+            os.kill(os.getpid(), self.left.pop(0)[1])
+        return True
+
+
+@pytest.fixture
+def handlers():
+    """Of the process, in the place of those of the interpreter."""
+    heard = []
+    before = {number: signal.signal(number, lambda *what: heard.append(what[0])) for number in (signal.SIGINT, signal.SIGTERM)}
+    present = {number: signal.getsignal(number) for number in before}
+    yield heard, lambda: {number: signal.getsignal(number) for number in present} == present
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    "number, error", [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)], ids=["SIGINT", "SIGTERM"]
+)
+@pytest.mark.parametrize("create", [make, make_dqn])
+def test_a_signal_saves_and_stops(tmp_path, capsys, handlers, create, number, error):
+    heard, are_restored = handlers
+    model = create()
+    with pytest.raises(error) as raised:
+        model.learn(STEPS, [TrainingCheckpoint(10**6, tmp_path), Send((70, number))])
+    if error is SystemExit:
+        assert raised.value.code == 143
+    assert heard == [] and are_restored()
+    checkpoint = find_checkpoint(tmp_path)
+    # The rollout was completed and learned from
+    assert checkpoint.num_timesteps == model.num_timesteps == (80 if create is make else 72)
+    printed = capsys.readouterr().out
+    assert f"saved to {checkpoint.path}" in printed and f'sb3_cchain.resume("{tmp_path}", env=...)' in printed
+    resumed = resume(tmp_path, make_env(), [TrainingCheckpoint(10**6, tmp_path), Send()], device="cpu")
+    assert resumed.num_timesteps == STEPS and are_restored()
+    assert_same(resumed, create().learn(STEPS))
+
+
+def test_a_second_signal_stops_at_once(tmp_path, handlers):
+    def hear(number, frame):
+        raise Stopped
+
+    signal.signal(signal.SIGINT, hear)
+    model = make()
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [TrainingCheckpoint(10**6, tmp_path), Send((70, signal.SIGINT), (72, signal.SIGINT))])
+    assert model.num_timesteps == 72 and signal.getsignal(signal.SIGINT) is hear and names(tmp_path) == []
+
+
+def test_a_second_signal_that_is_not_heeded(tmp_path, handlers):
+    """By the handler that was there before. The first one is then."""
+    heard, are_restored = handlers
+    with pytest.raises(KeyboardInterrupt):
+        make().learn(STEPS, [TrainingCheckpoint(10**6, tmp_path), Send((70, signal.SIGINT), (72, signal.SIGINT))])
+    assert heard == [signal.SIGINT] and are_restored() and find_checkpoint(tmp_path).num_timesteps == 80
+
+
+def test_handlers_are_restored_at_the_end(tmp_path, handlers):
+    heard, are_restored = handlers
+    make().learn(32, TrainingCheckpoint(16, tmp_path))
+    assert are_restored() and heard == []
+
+
+def test_signals_after_a_training_that_an_error_ended_are_not_kept(tmp_path, handlers):
+    heard, are_restored = handlers
+    model = make()
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [TrainingCheckpoint(16, tmp_path), Stop(40)])
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert heard == [signal.SIGTERM] and are_restored()
+
+
+def test_signals_in_another_training_after_an_error(tmp_path, handlers):
+    """Of the same process, without the callback."""
+    heard, _ = handlers
+    model = make()
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [TrainingCheckpoint(16, tmp_path), Stop(40)])
+    make().learn(32, Send((5, signal.SIGINT)))
+    assert heard == [signal.SIGINT]
+
+
+class SendToAll(BaseCallback):
+    """Ctrl-C, as a terminal sends it: to the processes of the environments, too."""
+
+    def _on_step(self):
+        if self.n_calls == 20:
+            os.killpg(0, signal.SIGINT)
+        return True
+
+
+def train_until_interrupt(path):
+    """For another process."""
+    os.setpgrp()
+    env = make_env(n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, wrapper_class=ResumableEnv)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        make(env).learn(STEPS, [TrainingCheckpoint(10**6, path), SendToAll()])
+    except KeyboardInterrupt:
+        return find_checkpoint(path).num_timesteps
+    finally:
+        env.close()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs groups of processes")
+def test_an_interrupt_of_all_processes(tmp_path):
+    assert in_new_process(train_until_interrupt, tmp_path) == 64
+
+
+# --- Kills ---------------------------------------------------------------------------------------------------------------
+
+N_KILLS = 20
+SAVE_WITHOUT_END = f"""
+import os, sys
+import torch._dynamo
+from stable_baselines3.common.callbacks import BaseCallback
+from sb3_cchain import TrainingCheckpoint, resume
+from tests.test_training_checkpoint import make_dqn, make_env
+torch.set_num_threads(1)
+path = sys.argv[1]
+for _ in range({N_KILLS}):
+    pid = os.fork()
+    if pid == 0:
+        if any(name.startswith("step_") for name in os.listdir(path)):
+            resume(path, make_env(), total_timesteps=10**9, device="cpu")
+        else:
+            make_dqn().learn(10**9, TrainingCheckpoint(1, path))
+    print(pid, flush=True)
+    os.waitpid(pid, 0)
+"""
+
+
+def newest_step(path):
+    return max((int(name[5:]) for name in names(path)), default=0)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs fork")
+def test_a_kill_while_it_saves_leaves_a_whole_checkpoint(tmp_path):
+    rng = random.Random(0)
+    command = [sys.executable, "-c", SAVE_WITHOUT_END, str(tmp_path)]
+    reached = [0]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1]) as program:
+        assert program.stdout is not None
+        for _ in range(N_KILLS):
+            pid = int(program.stdout.readline())
+            deadline = time.monotonic() + 60
+            # It saves all the time, so that it is killed at any point of that
+            while newest_step(tmp_path) <= reached[-1]:
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0, 0.05))
+            os.kill(pid, signal.SIGKILL)
+            reached.append(find_checkpoint(tmp_path).num_timesteps)
+    assert sorted(set(reached)) == reached
+    assert resume(tmp_path, make_env(), total_timesteps=reached[-1] + 100, device="cpu").num_timesteps >= reached[-1] + 100
+
+
+# --- Other callbacks -----------------------------------------------------------------------------------------------------
+
+
+def test_settings_are_those_of_the_new_process_and_counters_of_the_old(tmp_path):
+    def callbacks(folder):
+        evaluation = EvalCallback(
+            make_env(), eval_freq=30, n_eval_episodes=1, verbose=0, warn=False,
+            log_path=str(tmp_path / folder), best_model_save_path=str(tmp_path / folder),
+        )  # fmt: skip
+        inside = CheckpointCallback(10, str(tmp_path / folder), name_prefix="often")
+        every = EveryNTimesteps(40, CheckpointCallback(1, str(tmp_path / folder), name_prefix="every"))
+        return [CallbackList([evaluation, inside]), every]
+
+    train(make(), tmp_path / "checkpoints", *callbacks("old"))
+    new = callbacks("new")
+    resume(
+        tmp_path / "checkpoints",
+        make_env(),
+        [TrainingCheckpoint(32, tmp_path / "checkpoints"), *new, Stop(float("inf"))],
+        device="cpu",
+    )
+    (evaluation, inside), every = new[0].callbacks, new[1]
+    whole = callbacks("whole")
+    make().learn(STEPS, whole)
+    (expected, expected_inside), expected_every = whole[0].callbacks, whole[1]
+    assert (inside.n_calls, every.n_calls, evaluation.n_calls) == (STEPS,) * 3
+    assert every.last_time_trigger == expected_every.last_time_trigger
+    assert evaluation.evaluations_timesteps == expected.evaluations_timesteps == [30, 60, 90, 120, 150]
+    assert evaluation.evaluations_results == expected.evaluations_results
+    assert evaluation.best_mean_reward == expected.best_mean_reward
+    assert Path(evaluation.log_path).parent == tmp_path / "new"
+
+    def files(folder):
+        return {file.name for file in (tmp_path / folder).glob("*_steps.zip")}
+
+    # From the checkpoint on, and with the old counters
+    assert files("new") == {name for name in files("whole") if int(name.split("_")[1]) > NEWEST}
+    assert files("old") | files("new") == files("whole")
+    assert inside.save_path == str(tmp_path / "new") and expected_inside.save_freq == inside.save_freq
+
+
+def test_lambda_of_the_callback_form(tmp_path):
+    def churn():
+        return CChainCallback(churn_warmup=2, churn_window=3)
+
+    train(make(), tmp_path, churn())
+    resumed, whole = churn(), churn()
+    checkpoint = TrainingCheckpoint(32, tmp_path)
+    model = resume(tmp_path, make_env(), [checkpoint, resumed, Stop(float("inf"))], device="cpu")
+    assert_same(model, make().learn(STEPS, whole))
+    found, expected = resumed.churn_reducer.coefficient, whole.churn_reducer.coefficient
+    assert found.value == expected.value and found.n_seen == expected.n_seen > 4
+    assert all(th.equal(found.state_dict()[name], value) for name, value in expected.state_dict().items())
