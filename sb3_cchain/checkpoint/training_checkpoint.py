@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, package_versions
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, has_checkpoint, package_versions
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
 from sb3_cchain.checkpoint.files import sync_files
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
@@ -37,7 +37,7 @@ class TrainingCheckpoint(BaseCallback):
     learned from before that. A second signal ends the training at once.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
-    the same rhythm.
+    the same rhythm; when it is told to stop, it does not wait.
 
     Works with all algorithms of Stable-Baselines3 and sb3-contrib but ARS. The page "Stop and resume" says what is exact.
 
@@ -212,7 +212,12 @@ class TrainingCheckpoint(BaseCallback):
         self._release()
         stopped = f"Training was stopped at step {self.num_timesteps}"
         if saved is None:
-            print(f"{stopped}, in an episode that cannot be resumed. The last checkpoint is of step {self._last_saved}.")
+            newest = (
+                f"The last checkpoint is of step {self._last_saved}" if has_checkpoint(self.path) else "There is no checkpoint"
+            )
+            print(
+                f"{stopped}, in an episode whose beginning was not recorded, so that it was not saved. {newest}.", flush=True
+            )
         else:
             print(f"{stopped} and saved to {saved}. {self.advice}", flush=True)
         if self._stop_signal == signal.SIGTERM:
