@@ -19,6 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch as th
+import torch._dynamo  # PyTorch's optimisers import it when they are made, which takes longer than most processes here live
 from rich.console import Console
 from rich.progress import track
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -106,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=100, help="How often each training is killed")
     parser.add_argument("--steps", type=int, default=30_000, help="Environment steps of a training")
     parser.add_argument("--save-freq", type=int, default=128, help="Environment steps between checkpoints")
-    parser.add_argument("--longest", type=float, default=2.0, help="Seconds after which it is killed at the latest")
+    parser.add_argument("--longest", type=float, default=3.0, help="Seconds after which it is killed at the latest")
     parser.add_argument("--seed", type=int, default=0, help="Of the moments")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
