@@ -2,7 +2,20 @@
 
 import sb3_cchain.gym_notice  # noqa: F401  # isort: skip  # before Stable-Baselines3
 
-from sb3_cchain.algorithms import CChainCallback, CChainDQN, CChainPPO, DoubleDQN, FiniteCheck
+from importlib import import_module
+from typing import Any
+
+from sb3_cchain.algorithms import (
+    CChainA2C,
+    CChainCallback,
+    CChainDDPG,
+    CChainDQN,
+    CChainPPO,
+    CChainSAC,
+    CChainTD3,
+    DoubleDQN,
+    FiniteCheck,
+)
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, resume
@@ -13,9 +26,13 @@ from sb3_cchain.tensorboard import TensorBoardOverview
 
 __version__ = "0.1.0"
 __all__ = [
+    "CChainA2C",
     "CChainCallback",
+    "CChainDDPG",
     "CChainDQN",
     "CChainPPO",
+    "CChainSAC",
+    "CChainTD3",
     "ChurnMonitor",
     "ContinualEnv",
     "ContinualMetrics",
@@ -28,5 +45,19 @@ __all__ = [
     "make_lean",
     "resume",
 ]
+
+# Of sb3-contrib, which need not be installed: imported when they are asked for
+_CONTRIB = ("CChainCrossQ", "CChainMaskablePPO", "CChainQRDQN", "CChainRecurrentPPO", "CChainTQC", "CChainTRPO")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _CONTRIB:
+        return getattr(import_module("sb3_cchain.algorithms.contrib"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_CONTRIB])
+
 
 register_envs()

@@ -7,7 +7,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cchain import CChainDQN, CChainPPO, ContinualEnv, TaskSync
-from sb3_cchain.methods.registry import REGISTRY
+from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
 from tests.envs import CountEnv, RandomEnv
 
 STEPS_PER_TASK = 32
@@ -15,7 +15,9 @@ ON_POLICY = dict(n_steps=16, batch_size=8, n_epochs=2, policy_kwargs=dict(net_ar
 OFF_POLICY = dict(learning_starts=8, buffer_size=100, batch_size=8, train_freq=1, policy_kwargs=dict(net_arch=[8]))
 ALGORITHMS = {
     algorithm.__name__: partial(algorithm, **(ON_POLICY if issubclass(algorithm, OnPolicyAlgorithm) else OFF_POLICY))
-    for algorithm in dict.fromkeys([PPO, CChainPPO, DQN, *(method.algorithm for method in REGISTRY)])
+    for algorithm in dict.fromkeys(
+        [PPO, CChainPPO, DQN, *(method.algorithm for method in REGISTRY if method.page != FAMILY_PAGE)]
+    )
 }
 
 # Arguments with which methods do something in a few updates of a tiny network. Others are tested with their defaults.

@@ -10,8 +10,9 @@ from sb3_contrib import QRDQN, TQC, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 from sb3_cchain.analysis.metrics.churn import kl_divergence
-from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, evaluation_mode, model_outputs
+from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, model_outputs
 from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-2, 2, (2,), np.float32)

@@ -25,7 +25,7 @@ EXTRAS = {
     *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "yaml", "ray"),
     *("procgen", "gym3", "gym", "minatar", "shimmy", "dm_control", "dm_env", "mujoco", "Box2D"),
 }
-MODULES_OF_EXTRAS = ("sb3_cchain.zoo", "benchmarks")
+MODULES_OF_EXTRAS = ("sb3_cchain.zoo", "sb3_cchain.algorithms.contrib", "benchmarks")
 
 
 @cache

@@ -76,7 +76,8 @@ def test_continues_as_if_never_stopped(tmp_path, name, action_space, observation
     assert_equal(model, loaded)
     # Without the reference batch the next update has no churn loss
     if form.callback:
-        forgetful.churn_state["reducer"]["_extra_state"].update(reference=None, old_outputs=None)
+        for state in forgetful.churn_state["reducers"].values():
+            state["_extra_state"].update(reference=None, old_outputs=None)
     else:
         forgetful.churn_reducer.forget_reference()
     for each, callback in zip((model, loaded, forgetful), callbacks, strict=True):

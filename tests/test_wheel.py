@@ -98,8 +98,9 @@ def test_every_module_is_imported_without_extras_or_names_its_extra(run, wheel):
     path, errors = json.loads(run(["-c", IMPORT_ALL, *modules]))
     assert path.startswith(str(wheel))
     # The door to the command line names the extra; what is behind it fails with the missing module
-    assert all(name.startswith("sb3_cchain.zoo.") for name in errors)
+    assert all(name.startswith(("sb3_cchain.zoo.", "sb3_cchain.algorithms.contrib")) for name in errors)
     assert 'pip install "sb3-cchain[zoo]"' in errors["sb3_cchain.zoo.cli"]
+    assert 'pip install "sb3-cchain[contrib]"' in errors["sb3_cchain.algorithms.contrib"]
 
 
 TRAIN = """
@@ -119,6 +120,8 @@ CChainPPO.load("ppo", env=ppo.get_env()).learn(64, reset_num_timesteps=False)
 dqn = CChainDQN("MlpPolicy", env, learning_starts=16, buffer_size=500)
 dqn.learn(64, callback=[ChurnMonitor(), NTKCallback(), NetworkHealth()]).save("dqn")
 CChainDQN.load("dqn", env=dqn.get_env()).learn(32, reset_num_timesteps=False)
+
+CChainSAC("MlpPolicy", "Pendulum-v1", learning_starts=16, buffer_size=500).learn(32)
 
 for optimizer_class in (TRAC, WeightClipping, L2Init, Parseval):
     optimizer_kwargs = dict(n_output_layers=2) if optimizer_class is Parseval else {}
@@ -146,6 +149,7 @@ NEEDS = {
     "dmc": 'gymnasium.make("Continual/Walker-v0")',
     "procgen": 'gymnasium.make("Continual/Starpilot-v0")',
     "zoo": "import sb3_cchain.zoo.cli",
+    "contrib": "from sb3_cchain import CChainTQC",
     "plots": "CChainPPO('MlpPolicy', 'CartPole-v1', n_steps=64).learn(64, callback=NTKCallback(picture_interval=1))",
 }
 

@@ -248,7 +248,8 @@ OFF_POLICY = ["dqn", "crossq", *(method.algo for method in REGISTRY if issubclas
 def test_playing_makes_no_replay_buffer(algo, tmp_path, monkeypatch):
     zoo.register_algorithms()
     algorithm = ALGOS[algo]
-    env = "Pendulum-v1" if algo == "crossq" else "CartPole-v1"
+    is_discrete = "dqn" in algo
+    env = "CartPole-v1" if is_discrete else "Pendulum-v1"
     sizes, make = [], buffers.ReplayBuffer.__init__
 
     def spy(self, buffer_size, *args, **kwargs):

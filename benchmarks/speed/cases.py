@@ -4,11 +4,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import sb3_contrib
+import stable_baselines3
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
+import sb3_cchain
 from benchmarks.speed import sbx_ppo
 from benchmarks.speed.deepcopy_dqn import DeepCopyDQN
 from benchmarks.speed.deepcopy_ppo import DeepCopyPPO
@@ -137,6 +140,33 @@ def minatar(n_past_updates: int = 0) -> Case:
     return Case(entries, ["DoubleDQN"], 15, matrix_product(32, 1024, 128), note)
 
 
+def family() -> Case:
+    """
+    :return: Each of the other algorithms with churn reduction and its base, with their default targets and a small network
+    """
+    off_policy = dict(learning_starts=100, buffer_size=10_000)
+    settings: dict[str, dict[str, Any]] = {
+        "A2C": {},
+        "TRPO": dict(n_steps=128, batch_size=64),
+        "RecurrentPPO": dict(n_steps=128, batch_size=64, n_epochs=4),
+        "QRDQN": dict(train_freq=1, **off_policy),
+        **{name: off_policy for name in ("SAC", "TD3", "TQC", "CrossQ")},
+    }
+    entries = {}
+    for name, arguments in settings.items():
+        env = "Pendulum-v1" if name in ("SAC", "TD3", "TQC", "CrossQ") else "CartPole-v1"
+        policy = "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
+        for algorithm in (getattr(stable_baselines3, name, None) or getattr(sb3_contrib, name), f"CChain{name}"):
+            if isinstance(algorithm, str):
+                algorithm = getattr(sb3_cchain, algorithm)
+            model = algorithm(policy, env, policy_kwargs=dict(net_arch=[64, 64]), seed=0, device="cpu", **arguments)
+            timed_learn(model, 256, "", continual=False)  # from here on, every update has a churn loss
+            entries[algorithm.__name__] = Entry(partial(timed_learn, model, 128, "steps and updates", continual=False))
+    pairs = {f"CChain{name}": name for name in settings}
+    note = "Two hidden layers of 64. Each is divided by its own base."
+    return Case(entries, (), 7, note=note, base_of=pairs)
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "gym_control": partial(ppo, "Continual/Acrobot-v1", partial(matrix_product, 32, 256, 256), n_rounds=15),
     "dmc": partial(ppo, "Continual/Walker-v0", partial(matrix_product, 64, 256, 256), n_rounds=5),
@@ -147,4 +177,5 @@ CASES: dict[str, Callable[[], Case]] = {
     "related": related,
     "minatar": minatar,
     "minatar_later": partial(minatar, n_past_updates=50_000),
+    "family": family,
 }

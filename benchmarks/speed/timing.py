@@ -1,8 +1,8 @@
 """Processor time and floating-point operations of a case."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import ceil
 from typing import Any
 
@@ -65,6 +65,7 @@ class Case:
     :param n_rounds: How often each is timed
     :param product: The largest one of a forward pass, where operations are counted
     :param note: What the reader must know
+    :param base_of: The entry by whose seconds those of an entry are divided, where each has one of its own
     """
 
     entries: dict[str, Entry]
@@ -72,6 +73,7 @@ class Case:
     n_rounds: int
     product: Product | None = None
     note: str = ""
+    base_of: Mapping[str, str] = field(default_factory=dict)
 
 
 def seconds(call: Callable[[], Any]) -> float:
@@ -110,8 +112,8 @@ def time_case(case: Case, n_rounds: int | None = None) -> Table:
         for name, entry in case.entries.items():
             timings[name].append(entry.round())
 
-    first = case.bases[0]
-    header = ["", "", "seconds", *(f"time / {base}" for base in case.bases)]
+    first = next(iter(case.bases or case.entries))
+    header = ["", "", "seconds", *(f"time / {base}" for base in case.bases), *(["time / its base"] if case.base_of else [])]
     if case.product:
         header += [f"operations / {first}", "speed"]
     rows = []
@@ -121,6 +123,8 @@ def time_case(case: Case, n_rounds: int | None = None) -> Table:
             own = seconds_of[name]
             row = [measure, name, f"{np.median(own):.2g}"]
             row += ["1" if name == base else ratio(own, seconds_of[base]) for base in case.bases]
+            if case.base_of:
+                row.append(ratio(own, seconds_of[case.base_of[name]]) if name in case.base_of else "1")
             if case.product and measure == TRAIN:
                 share = np.median(entry.n_operations / own / speeds)
                 row += [f"{entry.n_operations / case.entries[first].n_operations:.2f}", f"{100 * share:.0f} %"]

@@ -11,15 +11,16 @@ from sb3_cchain import ContinualMetrics, TaskSync
 from sb3_cchain.replaced import replaced
 
 
-def timed_learn(model: Any, n_steps: int, whole: str) -> dict[str, float]:
+def timed_learn(model: Any, n_steps: int, whole: str, continual: bool = True) -> dict[str, float]:
     """
     :param model: A model
     :param n_steps: Environment steps
     :param whole: Name of the measure that is all of it
+    :param continual: Whether its environment is continual
     :return: Seconds of ``train()``, and of all
     """
-    # CChainPPO and CChainDQN would add these callbacks by themselves
-    callbacks: list[BaseCallback] = [TaskSync(), ContinualMetrics()]
+    # CChainPPO and others would add these callbacks by themselves
+    callbacks: list[BaseCallback] = [TaskSync(), ContinualMetrics()] if continual else []
     inside = TimeInside()
     with replaced(model, "train", model.train):  # afterwards, what `watch()` puts there is gone
         inside.watch(model, "train")

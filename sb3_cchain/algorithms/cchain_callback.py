@@ -1,15 +1,19 @@
-"""C-CHAIN for a stock ``PPO``, for instance one that the stock ``rl_zoo3`` command trains."""
+"""C-CHAIN for a stock model, for instance one that the stock ``rl_zoo3`` command trains."""
 
 from contextlib import ExitStack
-from functools import partial
+from typing import Any
 
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EventCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.algorithms.churn_state import keep_churn_state
+from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
-from sb3_cchain.algorithms.on_policy import PolicyChurnOptions, make_policy_reducer, reduced_churn
-from sb3_cchain.churn import make_coefficient
+from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
+from sb3_cchain.algorithms.reduced_churn import reduced_churn
+from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.callback_tree import require_single
@@ -20,43 +24,47 @@ from sb3_cchain.validation import check_bool
 
 class CChainCallback(FiniteCheck):
     """
-    Trains a stock :class:`~stable_baselines3.PPO` as :class:`~sb3_cchain.CChainPPO` trains, for instance from the YAML file
-    of the stock ``rl_zoo3``::
+    Trains a stock model of SB3 or sb3-contrib as the algorithm of this package trains that has its name, such as
+    :class:`~sb3_cchain.CChainPPO`, for instance from the YAML file of the stock ``rl_zoo3``::
 
         callback:
           - sb3_cchain.CChainCallback:
               target_churn_ratio: 1.0e+4
 
-    PPO calls its callbacks right before each ``train()``; the callback then makes the next ``train()`` reduce churn. The
+    It is for PPO, A2C, TRPO, MaskablePPO, RecurrentPPO, DQN, QRDQN, SAC, TQC, CrossQ, TD3 and DDPG.
+
+    SB3 calls callbacks right before each ``train()``; the callback then makes the next ``train()`` reduce churn. The
     history of λ and the reference batch are kept with the model and saved with it. Training with a CChainCallback goes on
-    with them, whether the model was loaded or ``learn()`` was called again. The stock ``PPO.load`` loads such a model, too.
+    with them, whether the model was loaded or ``learn()`` was called again. The stock ``load`` loads such a model, too.
 
     Rewards and observations that are NaN or infinite raise a ``ValueError`` before they are trained on.
 
-    :param churn_coef: As for ``CChainPPO``
-    :param target_churn_ratio: As for ``CChainPPO``
-    :param churn_warmup: As for ``CChainPPO``
-    :param churn_window: As for ``CChainPPO``
-    :param churn_coef_min: As for ``CChainPPO``
-    :param reset_churn_coef: As for ``CChainPPO``
+    :param churn_coef: As for :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+    :param target_churn_ratio: As for ``ChurnAlgorithm``
+    :param churn_warmup: As for ``ChurnAlgorithm``
+    :param churn_window: As for ``ChurnAlgorithm``
+    :param churn_coef_min: As for ``ChurnAlgorithm``
+    :param reset_churn_coef: As for ``ChurnAlgorithm``
     :param churn_base_loss: As for ``CChainPPO``
-    :param churn_component: As for ``CChainPPO``
-    :param churn_reference: As for ``CChainPPO``
-    :param churn_batch_size: As for ``CChainPPO``
+    :param churn_component: As for ``CChainPPO``; another one than ``"full"`` is for PPO alone
+    :param churn_reference: As for ``CChainPPO``; another one than ``"independent"`` is for PPO and TRPO
+    :param churn_batch_size: As for ``CChainPPO``; another one than 1 is for PPO and TRPO
     :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.make_lean`
-    :raises ValueError: Naming the argument that is out of its range; when training starts, for a second CChainCallback in the
-        same ``learn()``, and for one that another callback holds
-    :raises TypeError: When ``reset_churn_coef`` is not a boolean; when training starts, for a model that is not a stock PPO
+    :param churn_target: As for ``ChurnAlgorithm``
+    :raises ValueError: Naming the argument that is out of its range; when training starts, for one that the model's algorithm
+        does not have, for a second CChainCallback in the same ``learn()``, and for one that another callback holds
+    :raises TypeError: When ``reset_churn_coef`` is not a boolean; when training starts, for a model of another algorithm, or
+        one that reduces churn itself
     """
 
-    model: PPO
+    churn_reducers: ChurnReducers
 
     def __init__(
         self,
-        churn_coef: float | str = "auto",
-        target_churn_ratio: float | str = "auto",
-        churn_warmup: int = 10,
-        churn_window: int = 50,
+        churn_coef: float | str | dict[str, float | str] = "auto",
+        target_churn_ratio: float | str | dict[str, float | str] = "auto",
+        churn_warmup: int | None = None,
+        churn_window: int | None = None,
         churn_coef_min: float = 0.0,
         reset_churn_coef: bool = False,
         churn_base_loss: str = "actor",
@@ -64,17 +72,13 @@ class CChainCallback(FiniteCheck):
         churn_reference: str = "independent",
         churn_batch_size: float = 1.0,
         lean: bool = True,
+        churn_target: str = "auto",
     ):
         super().__init__()
-        self._make_coefficient = partial(
-            make_coefficient,
-            churn_coef,
-            target_churn_ratio,
-            warmup=churn_warmup,
-            window=churn_window,
-            minimum=churn_coef_min,
+        self._arguments = ChurnArguments(
+            churn_target, churn_coef, target_churn_ratio, churn_warmup, churn_window, churn_coef_min
         )
-        self._make_coefficient(default_target_ratio=1.0)  # raise on bad values now
+        self._arguments.check()  # raise on bad values now
         check_bool("reset_churn_coef", reset_churn_coef)
         check_bool("lean", lean)
         self._options = PolicyChurnOptions(churn_base_loss, churn_component, churn_reference, churn_batch_size)
@@ -84,19 +88,38 @@ class CChainCallback(FiniteCheck):
         # The methods of the model that are replaced from the end of a rollout to train()
         self._replaced = ExitStack()
 
+    @property
+    def churn_reducer(self) -> ChurnReducer:
+        """The only churn reducer, or the first of several."""
+        return self.churn_reducers.first
+
     def _init_callback(self) -> None:
-        if not isinstance(self.model, PPO):
-            raise TypeError(f"CChainCallback trains PPO, got {type(self.model).__name__}")
-        if hasattr(self.model, "churn_reducer"):
-            raise TypeError(f"{type(self.model).__name__} reduces churn by itself; give CChainCallback to a stock PPO")
+        model: Any = self.model
+        name = type(model).__name__
+        if hasattr(model, "churn_reducers"):
+            raise TypeError(f"{name} reduces churn by itself; give CChainCallback to a stock model")
+        self._check_options(name, self._arguments.target_names(churn_kind(type(model)), name))
         self._check_parent()
-        add_overview(self.model)
-        if self.lean:
-            make_lean(self.model)
-        self.churn_reducer = make_policy_reducer(self.model, self._make_coefficient)
-        past, n_updates = vars(self.model).get("churn_state"), self.model._n_updates
-        self._state = keep_churn_state(self.model, self.churn_reducer, self._task_switch, past, n_updates)
+        add_overview(model)
+        if self.lean and isinstance(model, OnPolicyAlgorithm):
+            make_lean(model)
+        self.churn_reducers = self._arguments.make_reducers(model)
+        past, n_updates = vars(model).get("churn_state"), model._n_updates
+        self._state = keep_churn_state(model, self.churn_reducers, self._task_switch, past, n_updates)
         self._state.n_updates = n_updates
+
+    def _check_options(self, algorithm: str, targets: tuple[str, ...]) -> None:
+        default = PolicyChurnOptions()
+        has_ppos_references = isinstance(self.model, PPO) or _is_trpo(self.model)
+        for argument, is_known in (
+            ("churn_base_loss", isinstance(self.model, OnPolicyAlgorithm)),
+            ("churn_component", isinstance(self.model, PPO) and targets == ("policy",)),
+            ("churn_reference", has_ppos_references),
+            ("churn_batch_size", has_ppos_references),
+        ):
+            given, only = getattr(self._options, argument), getattr(default, argument)
+            if given != only and not is_known:
+                raise ValueError(f"`{argument}` must be {only!r} for {algorithm} that holds still {targets}, got {given!r}")
 
     def _check_parent(self) -> None:
         if isinstance(self.parent, EventCallback):
@@ -115,23 +138,27 @@ class CChainCallback(FiniteCheck):
     def _on_step(self) -> bool:
         super()._on_step()
         if self.reset_churn_coef and self._task_switch.happened(step_task(self.model, self.locals["infos"])):
-            self.churn_reducer.coefficient.reset()
+            for reducer in self.churn_reducers.values():
+                reducer.coefficient.reset()
         return True
 
     def _on_rollout_end(self) -> None:
         super()._on_rollout_end()
-        if self.churn_reducer.coefficient.is_zero:
+        # Off-policy, train() does not follow on each rollout
+        self._replaced.close()
+        if not self.churn_reducers.active():
             return
-        train, not_saved = self.model.train, [*self.model._excluded_save_params(), "train", "_excluded_save_params"]
+        model: Any = self.model
+        train, not_saved = model.train, [*model._excluded_save_params(), "train", "_excluded_save_params"]
 
-        def train_once() -> None:
+        def train_once(*args: Any, **kwargs: Any) -> None:
             self._replaced.close()  # first, so that this method is gone when train() fails, too
             if self.model.start_time != self._start_time:
                 # Left from a learn() that was interrupted between the end of a rollout and train()
-                train()
+                train(*args, **kwargs)
                 return
-            with reduced_churn(self.model, self.churn_reducer, self._options):
-                train()
+            with reduced_churn(self.model, self.churn_reducers, self._options):
+                train(*args, **kwargs)
             self._state.n_updates = self.model._n_updates
 
         self._replaced.enter_context(replaced(self.model, "train", train_once))
@@ -141,3 +168,8 @@ class CChainCallback(FiniteCheck):
     def _on_training_end(self) -> None:
         self._replaced.close()
         super()._on_training_end()
+
+
+def _is_trpo(model: BaseAlgorithm) -> bool:
+    # By its name, as sb3-contrib need not be installed
+    return any(base.__name__ == "TRPO" for base in type(model).__mro__)

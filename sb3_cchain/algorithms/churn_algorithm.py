@@ -10,9 +10,12 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
 from sb3_cchain.algorithms.churn_state import keep_churn_state
+from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
+from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
+from sb3_cchain.algorithms.reduced_churn import reduced_churn
 from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
-from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, make_coefficient
+from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
@@ -20,18 +23,24 @@ from sb3_cchain.validation import check_bool
 
 class ChurnAlgorithm(BaseAlgorithm):
     """
-    Adds the churn arguments, a :class:`~sb3_cchain.churn.ChurnReducer` whose state is saved with the model, a check for NaN
-    in what the environment gives, the callbacks for continual environments and the overview in TensorBoard to an SB3
-    algorithm. A subclass builds the reducer in ``_make_churn_reducer()`` and uses it in ``train()``.
+    Makes an algorithm of SB3 or sb3-contrib reduce churn: ``class CChainSAC(ChurnAlgorithm, SAC)``.
+
+    Its own ``train()`` runs unchanged; the gradient of λ·L_churn is added right after each ``zero_grad()``. The state of
+    churn reduction is saved with the model. There are also a check for NaN in what the environment gives, the callbacks for
+    continual environments, and the overview in TensorBoard.
 
     :param args: Arguments of the base algorithm
+    :param churn_target: What is held still: ``"policy"``, ``"value"`` or ``"both"``. ``"auto"`` is the policy, or the
+        values of an algorithm without a policy that could be held still (DQN, QRDQN, TRPO).
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
         ``target_churn_ratio`` times the base loss, or ``"auto_10"`` to use 10 instead of 1 during the warm-up.
-        With 0 the algorithm is its base, to the bit.
+        With 0 the algorithm is its base, to the bit. One for all, or a dict, ``{"policy": ..., "value": ...}``.
     :param target_churn_ratio: β, the size of λ·L_churn relative to the base loss. ``"auto"`` is a default for the kind of
-        the network's outputs.
-    :param churn_warmup: Iterations until λ adapts: calls of ``train()`` with PPO, gradient updates with DQN
-    :param churn_window: Iterations that the running means of both losses cover
+        the network's outputs. One for all, or a dict, ``{"policy": ..., "value": ...}``.
+    :param churn_warmup: Iterations until λ adapts: calls of ``train()`` on-policy, gradient updates off-policy. None is 10 for
+        PPO, MaskablePPO and RecurrentPPO; for all others 0, where λ adapts after the first churn loss.
+    :param churn_window: Iterations that the running means of both losses cover. None is 50 for PPO, MaskablePPO, RecurrentPPO
+        and TRPO, and 1000 for all others, A2C included, in which an iteration is one gradient update.
     :param churn_coef_min: Least value of λ once it adapts
     :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the code
         released with the paper. Off by default, because C-CHAIN does not need to be told of a switch.
@@ -40,51 +49,91 @@ class ChurnAlgorithm(BaseAlgorithm):
     :raises TypeError: When ``reset_churn_coef`` is not a boolean
     """
 
-    churn_reducer: ChurnReducer
+    churn_reducers: ChurnReducers
 
     def __init__(
         self,
         *args: Any,
-        churn_coef: float | str = "auto",
-        target_churn_ratio: float | str = "auto",
-        churn_warmup: int = 10,
-        churn_window: int = 50,
+        churn_target: str = "auto",
+        churn_coef: float | str | dict[str, float | str] = "auto",
+        target_churn_ratio: float | str | dict[str, float | str] = "auto",
+        churn_warmup: int | None = None,
+        churn_window: int | None = None,
         churn_coef_min: float = 0.0,
         reset_churn_coef: bool = False,
         **kwargs: Any,
     ):
+        kind = churn_kind(type(self))
+        self.churn_target = churn_target
         self.churn_coef = churn_coef
         self.target_churn_ratio = target_churn_ratio
-        self.churn_warmup = churn_warmup
-        self.churn_window = churn_window
+        self.churn_warmup = kind.warmup if churn_warmup is None else churn_warmup
+        self.churn_window = kind.window if churn_window is None else churn_window
         self.churn_coef_min = churn_coef_min
         self.reset_churn_coef = reset_churn_coef
         # Raise on bad values before an environment is made
         check_bool("reset_churn_coef", reset_churn_coef)
-        self._make_churn_coefficient(default_target_ratio=1.0)
+        self._churn_options()
+        arguments = self._churn_arguments()
+        arguments.check()
+        arguments.target_names(kind, type(self).__name__)
         self._task_switch = TaskSwitch()
         self._is_first_training = True
         super().__init__(*args, **kwargs)
 
-    def _make_churn_coefficient(self, default_target_ratio: float) -> ChurnCoefficient:
-        return make_coefficient(
+    @property
+    def churn_reducer(self) -> ChurnReducer:
+        """The only churn reducer, or the first of several."""
+        return self.churn_reducers.first
+
+    def _churn_arguments(self) -> ChurnArguments:
+        return ChurnArguments(
+            self.churn_target,
             self.churn_coef,
             self.target_churn_ratio,
-            default_target_ratio,
-            warmup=self.churn_warmup,
-            window=self.churn_window,
-            minimum=self.churn_coef_min,
+            self.churn_warmup,
+            self.churn_window,
+            self.churn_coef_min,
         )
 
-    def _make_churn_reducer(self) -> ChurnReducer:
-        raise NotImplementedError()
+    def _churn_options(self) -> PolicyChurnOptions:
+        return PolicyChurnOptions()
+
+    def _make_churn_reducers(self) -> ChurnReducers:
+        self._churn_options()  # load() does not give them to __init__()
+        arguments = self._churn_arguments()
+        arguments.check()
+        return arguments.make_reducers(self)
 
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
-        self.churn_reducer = self._make_churn_reducer()
+        self.churn_reducers = self._make_churn_reducers()
         # `load()` puts in the state that was saved, as a dict, and calls `set_parameters()` next, which takes it
         if not isinstance(vars(self).get("churn_state"), dict):
-            keep_churn_state(self, self.churn_reducer, self._task_switch)
+            keep_churn_state(self, self.churn_reducers, self._task_switch)
+
+    def train(self, *args: Any, **kwargs: Any) -> None:
+        """
+        As the base algorithm does, with churn reduction.
+
+        :param args: As of the base algorithm
+        :param kwargs: As of the base algorithm
+        """
+        with reduced_churn(self, self.churn_reducers, self._churn_options()):
+            super().train(*args, **kwargs)  # type: ignore[misc]
+
+    def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+        """
+        As the base algorithm's. In a continual environment the callbacks that follow its tasks are added.
+
+        :param total_timesteps: Environment steps to train for
+        :param args: As of the base algorithm
+        :param kwargs: As of the base algorithm. The run in TensorBoard is by default named after the class.
+        :return: The trained model
+        """
+        if len(args) < 3:
+            kwargs.setdefault("tb_log_name", type(self).__name__)
+        return super().learn(total_timesteps, *args, **kwargs)  # type: ignore[safe-super]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
@@ -108,17 +157,18 @@ class ChurnAlgorithm(BaseAlgorithm):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)
         if self.reset_churn_coef and self._task_switch.happened(step_task(self, infos)):
-            self.churn_reducer.coefficient.reset()
+            for reducer in self.churn_reducers.values():
+                reducer.coefficient.reset()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        if "churn_reducer" in state:
+        if "churn_reducers" in state:
             # A copy, by pickle or deepcopy: `churn_state` became a dict of that moment, and has to follow the copy's training
-            keep_churn_state(self, self.churn_reducer, self._task_switch)
+            keep_churn_state(self, self.churn_reducers, self._task_switch)
 
     def _excluded_save_params(self) -> list[str]:
         # They are in `churn_state`
-        return [*super()._excluded_save_params(), "churn_reducer", "_task_switch"]
+        return [*super()._excluded_save_params(), "churn_reducers", "_task_switch"]
 
     def set_parameters(
         self,
@@ -144,5 +194,5 @@ class ChurnAlgorithm(BaseAlgorithm):
             data, params, _ = load_from_zip_file(load_path_or_dict, device=device)
             past, n_updates = (data or {}).get("churn_state"), (data or {}).get("_n_updates", 0)
         super().set_parameters(params, exact_match, device)
-        self.churn_reducer = self._make_churn_reducer()
-        keep_churn_state(self, self.churn_reducer, self._task_switch, past, n_updates)
+        self.churn_reducers = self._make_churn_reducers()
+        keep_churn_state(self, self.churn_reducers, self._task_switch, past, n_updates)

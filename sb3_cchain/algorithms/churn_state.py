@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.tasks.signal import TaskSwitch
 
 
@@ -16,23 +16,31 @@ class ChurnState:
     this package, too.
 
     :param model: The model
-    :param reducer: Its churn reducer
+    :param reducers: Its churn reducers, by the name of the target
     :param task_switch: What notices that the task has changed
     """
 
-    def __init__(self, model: BaseAlgorithm, reducer: ChurnReducer, task_switch: TaskSwitch):
+    def __init__(self, model: BaseAlgorithm, reducers: ChurnReducers, task_switch: TaskSwitch):
         self.model = model
-        self.reducer = reducer
+        self.reducers = reducers
         self.task_switch = task_switch
         # `model._n_updates` after the last training with churn reduction; None when there is no other training
         self.n_updates: int | None = None
+
+    @property
+    def reducer(self) -> ChurnReducer:
+        """The only churn reducer, or the first of several."""
+        return self.reducers.first
 
     def as_dict(self) -> dict[str, Any]:
         """
         :return: The state at this moment
         """
         return {
-            "reducer": _map_tensors(lambda tensor: tensor.detach().cpu().clone(), self.reducer.state_dict()),
+            "reducers": {
+                name: _map_tensors(lambda tensor: tensor.detach().cpu().clone(), reducer.state_dict())
+                for name, reducer in self.reducers.items()
+            },
             "task_id": self.task_switch.task_id,
             "n_updates": self.model._n_updates if self.n_updates is None else self.n_updates,
         }
@@ -42,16 +50,17 @@ class ChurnState:
 
 
 def keep_churn_state(
-    model: BaseAlgorithm, reducer: ChurnReducer, task_switch: TaskSwitch, past: Any = None, n_updates: int = 0
+    model: BaseAlgorithm, reducers: ChurnReducers, task_switch: TaskSwitch, past: Any = None, n_updates: int = 0
 ) -> ChurnState:
     """
-    Let ``reducer`` go on from a past state, and save its state with the model from now on.
+    Let the reducers go on from a past state, and save their state with the model from now on.
 
-    λ starts over when the past one was of another kind or had another window. The reference batch is forgotten when the model
-    was trained without churn reduction in the meantime, because what changed on it is not the churn of one update.
+    A reducer starts over when the past state has none for its target. λ starts over when the past one was of another kind or
+    had another window. The reference batch is forgotten when the model was trained without churn reduction in the meantime,
+    because what changed on it is not the churn of one update.
 
     :param model: A model
-    :param reducer: Its churn reducer, which is new
+    :param reducers: Its churn reducers, which are new, by the name of the target
     :param task_switch: What notices that the task has changed
     :param past: The past state: a :class:`ChurnState`, or the dict of it in a saved file; None to start over
     :param n_updates: ``_n_updates`` of the model with the past state, as it is now or was when it was saved
@@ -60,14 +69,16 @@ def keep_churn_state(
     if isinstance(past, ChurnState):
         past = past.as_dict()
     if past is not None:
-        saved, fresh = past["reducer"], reducer.state_dict()
-        same_kind = _shapes(saved) == _shapes(fresh)
-        reducer.load_state_dict(saved if same_kind else {**fresh, "_extra_state": saved["_extra_state"]})
-        reducer.move_reference(model.device)
         task_switch.task_id = past["task_id"]
-        if past["n_updates"] != n_updates:
-            reducer.forget_reference()
-    state = model.churn_state = ChurnState(model, reducer, task_switch)  # type: ignore[attr-defined]
+        for name in reducers.keys() & past["reducers"].keys():
+            reducer = reducers[name]
+            saved, fresh = past["reducers"][name], reducer.state_dict()
+            same_kind = _shapes(saved) == _shapes(fresh)
+            reducer.load_state_dict(saved if same_kind else {**fresh, "_extra_state": saved["_extra_state"]})
+            reducer.move_reference(model.device)
+            if past["n_updates"] != n_updates:
+                reducer.forget_reference()
+    state = model.churn_state = ChurnState(model, reducers, task_switch)  # type: ignore[attr-defined]
     return state
 
 

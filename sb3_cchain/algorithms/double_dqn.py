@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional as F
 
-from sb3_cchain.algorithms.off_policy import finite_td_loss
+from sb3_cchain.algorithms.q_network import finite_td_loss
 from sb3_cchain.checkpoint import TrainingCheckpoint
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
 from sb3_cchain.tasks.callback_tree import iterate_callbacks

@@ -7,10 +7,10 @@ from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSam
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
-from sb3_cchain.algorithms.off_policy import QValues, finite_td_loss, joint_pass, log_q_churn, make_q_reducer
+from sb3_cchain.algorithms.q_network import QValues, finite_td_loss, joint_pass, log_q_churn
 from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.algorithms.replay_observations import sample_observations
-from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
 from sb3_cchain.validation import check_choice
@@ -57,22 +57,29 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     def __init__(
         self,
         *args: Any,
-        churn_coef: float | str = "auto",
-        churn_warmup: int = 0,
-        churn_window: int = 1000,
         churn_reference: str = "independent",
         **kwargs: Any,
     ):
         self.churn_reference = churn_reference
-        super().__init__(*args, churn_coef=churn_coef, churn_warmup=churn_warmup, churn_window=churn_window, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_choice("churn_reference", self.churn_reference, REFERENCES)
 
-    def _make_churn_reducer(self) -> ChurnReducer:
+    def _make_churn_reducers(self) -> ChurnReducers:
         self._next_minibatch = None  # it waited with the reducer that is replaced
-        return make_q_reducer(self, self._make_churn_coefficient)
+        return super()._make_churn_reducers()
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Update the Q-network, as DoubleDQN does, with churn reduction in the loss.
+
+        :param gradient_steps: Number of gradient updates
+        :param batch_size: Minibatch size
+        :raises ValueError: When the loss is NaN or infinite. The parameters have not been updated.
+        """
+        DoubleDQN.train(self, gradient_steps, batch_size)
 
     def _excluded_save_params(self) -> list[str]:
         # It belongs to the replay buffer, which is saved apart

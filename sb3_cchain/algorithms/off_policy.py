@@ -1,148 +1,77 @@
-"""Churn reduction of a Q-network: its reducer, the forward passes that it shares with DQN's update, and what is logged."""
+"""Churn reduction of an off-policy algorithm's unmodified ``train()``: where the gradient goes in, and what is logged."""
 
-import math
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
 import torch as th
-from stable_baselines3 import DQN
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_cchain.churn import ChurnCoefficient, ChurnReducer, mean_squared_difference
-from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
-from sb3_cchain.churn.reducer import Observations
-from sb3_cchain.networks.policy_inputs import joined, n_observations
-
-# β when `target_churn_ratio="auto"`: the paper's
-DEFAULT_TARGET_RATIO = 0.01
+from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
+from sb3_cchain.algorithms.replay_observations import sample_observations, sample_with_actions
+from sb3_cchain.churn import ChurnReducer, extra_gradient
+from sb3_cchain.churn.divergence import mean_absolute_change
+from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
+from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.networks.policy_outputs import has_training_mode
 
 
-def make_q_reducer(model: DQN, make_coefficient: Callable[[float], ChurnCoefficient]) -> ChurnReducer:
+@contextmanager
+def reduced_off_policy(model: Any, reducers: Mapping[str, ChurnReducer]) -> Iterator[None]:
     """
-    :param model: A model, whose policy exists
-    :param make_coefficient: Makes λ, given the default β
-    :return: The reducer of the Q-network's churn: the mean squared change of all action values
+    Run ``model``'s own ``train()`` in this block to train it with churn reduction. Reference batches are samples of the replay
+    buffer, of the size of a minibatch and drawn independently of the minibatches.
+
+    Afterwards λ has been updated, each gradient update counting as an iteration, and ``churn/…`` logged, averages over the
+    updates between two logs:
+
+    - ``churn/loss``: the churn loss L_churn
+    - ``churn/coef``: the λ it was multiplied by, the same in all updates of a ``train()``
+    - ``churn/relative_loss``: λ·L_churn / \\|L\\|, of each ``train()``. The mean of these ratios is greater than the ratio of
+      the means, which an adaptive λ holds at β
+    - ``churn/policy_churn``: mean squared change of the actions by an update
+    - ``churn/value_churn``: mean absolute change of the values by an update
+
+    With two targets, what belongs to one is logged as ``churn/policy/…`` or ``churn/value/…``.
+
+    :param model: A model of an off-policy algorithm
+    :param reducers: Its churn reducers by the name of the target, those with a λ that is not 0
     """
-    # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
-    return ChurnReducer(partial(_q_values, model), mean_squared_difference, make_coefficient(DEFAULT_TARGET_RATIO))
+    targets, optimizers = churn_kind(type(model)).targets, model_optimizers(model)
+    changes: dict[str, list[float]] = {name: [] for name in reducers}
+    coefs = {}
+    with ExitStack() as stack:
+        for name, reducer in reducers.items():
+            reducer.discard_losses()  # of a training that was interrupted
+            coefs[name] = reducer.coefficient.value
+            before_update = partial(_hold_still, model, targets[name], reducer, changes[name])
+            stack.enter_context(extra_gradient(optimizers[targets[name].optimizer], before_update))
+        yield
+    for name, reducer in reducers.items():
+        if reducer.losses:
+            loss = abs(targets[name].base_loss(model))
+            prefix = "churn" if len(reducers) == 1 else f"churn/{name}"
+            churn_loss = np.mean(reducer.losses)
+            model.logger.record_mean(f"{prefix}/loss", churn_loss)
+            model.logger.record_mean(f"{prefix}/coef", coefs[name])
+            model.logger.record_mean(f"{prefix}/relative_loss", coefs[name] * churn_loss / (loss + 1e-8))
+            churn = reducer.mean_churn() if name == "policy" else np.mean(changes[name])
+            model.logger.record_mean(f"churn/{name}_churn", churn)
+            reducer.end_iteration(loss, each_update=True)
 
 
-def _q_values(model: DQN, observations: Observations) -> th.Tensor:
-    return model.policy.q_net(observations)
-
-
-class QValues(NamedTuple):
-    """The online network's action values that an update of C-CHAIN DQN needs, ``(batch_size, n_actions)`` each."""
-
-    # Of the minibatch's observations
-    current: th.Tensor
-    # Of its next observations, without gradient; None without Double Q-learning
-    next: th.Tensor | None
-    # Of the reference batch that the next update's churn loss is computed on, without gradient
-    reference: th.Tensor
-    # Of the reference batch of the update before; None in the first update
-    previous_reference: th.Tensor | None
-
-
-def joint_pass(
-    q_net: Callable[[Observations], th.Tensor],
-    replay_data: ReplayBufferSamples,
-    reference: Observations,
-    previous_reference: Observations | None,
-    double_q: bool,
-) -> QValues:
-    """
-    Compute all action values in the two forward passes of Double DQN: the reference batch goes through the network together
-    with the next observations (no gradient), the reference batch of the update before together with the observations.
-    Without Double Q-learning the reference batch needs a pass of its own, because DQN's next observations go through the
-    target network only.
-
-    Right only where the outputs of one sample do not depend on the other samples, nor on training or evaluation mode.
-
-    :param q_net: The online network
-    :param replay_data: The minibatch
-    :param reference: The reference batch that was drawn for the next update
-    :param previous_reference: The reference batch that was drawn in the update before
-    :param double_q: Whether the next observations' values are needed
-    :return: The action values
-    """
-    next_values = None
-    with th.no_grad():
-        if double_q:
-            next_values, reference_values = _both(q_net, replay_data.next_observations, reference)
-        else:
-            reference_values = q_net(reference)
-    if previous_reference is None:
-        return QValues(q_net(replay_data.observations), next_values, reference_values, None)
-    values, previous_values = _both(q_net, replay_data.observations, previous_reference)
-    return QValues(values, next_values, reference_values, previous_values)
-
-
-def _both(
-    q_net: Callable[[Observations], th.Tensor], minibatch: Observations, reference: Observations
-) -> tuple[th.Tensor, th.Tensor]:
-    """One pass for two batches."""
-    values, reference_values = q_net(joined(minibatch, reference)).split(
-        [n_observations(minibatch), n_observations(reference)]
-    )
-    return values, reference_values
-
-
-def log_q_churn(logger: Logger, coef: float, churn_loss: float, td_loss: float, old: th.Tensor, new: th.Tensor) -> None:
-    """
-    Log the churn of one update. The logger averages over the updates between two logs, and holds no tensor.
-
-    - ``churn/loss``: the churn loss L_churn, the mean squared change of all action values
-    - ``churn/coef``: the λ it was multiplied by
-    - ``churn/relative_loss``: λ·L_churn / L, where L is the TD loss. The mean of these ratios is greater than the ratio of the
-      means, which an adaptive λ holds at β
-    - ``churn/value_churn``: mean absolute change of the action values by an update
-    - ``churn/greedy_action_changes``: share of the states whose greedy action an update changed
-
-    :param logger: The model's logger
-    :param coef: λ
-    :param churn_loss: L_churn
-    :param td_loss: L
-    :param old: Action values of the reference batch before an update, ``(batch_size, n_actions)``
-    :param new: Action values of the same batch after it
-    """
-    logger.record_mean("churn/loss", churn_loss)
-    logger.record_mean("churn/coef", coef)
-    logger.record_mean("churn/relative_loss", coef * churn_loss / (td_loss + 1e-8))
-    logger.record_mean("churn/value_churn", mean_absolute_change(old, new))
-    logger.record_mean("churn/greedy_action_changes", action_changes(old.argmax(dim=1), new.argmax(dim=1)))
-
-
-def finite_td_loss(loss: th.Tensor, replay_data: ReplayBufferSamples) -> float:
-    """
-    :param loss: The mean loss of the TD errors
-    :param replay_data: The minibatch that it was computed on
-    :return: Its value
-    :raises ValueError: When it is NaN or infinite, naming what made it so
-    """
-    value = loss.item()
-    if math.isfinite(value):
-        return value
-    raise ValueError(f"The TD loss is {value}: {_cause(replay_data)} The parameters have not been updated.")
-
-
-def _cause(replay_data: ReplayBufferSamples) -> str:
-    for name, data in (
-        ("rewards", replay_data.rewards),
-        ("observations", replay_data.observations),
-        ("next observations", replay_data.next_observations),
-    ):
-        for tensor in data.values() if isinstance(data, dict) else [data]:
-            wrong = tensor[~tensor.isfinite()]
-            if len(wrong):
-                return (
-                    f"the {name} of the minibatch hold {wrong[0].item()}. Fix the environment, or clip what it returns; "
-                    "the replay buffer holds the faulty transition."
-                )
-    return (
-        "the network's action values are too large or NaN, while the observations and rewards of the minibatch are finite "
-        f"(the largest reward is {replay_data.rewards.abs().max().item():g} in absolute value). Scale the rewards, lower the "
-        "learning rate or set `max_grad_norm`."
-    )
+def _hold_still(model: Any, target: ChurnTarget, reducer: ChurnReducer, changes: list[float]) -> None:
+    """Right after ``zero_grad()``."""
+    sample = sample_with_actions if target.needs else sample_observations
+    reference = sample(model.replay_buffer, model.batch_size, model._vec_normalize_env)
+    policy = uncompiled(model.policy)
+    network = getattr(policy, target.optimizer) if target.optimizer else policy
+    old: th.Tensor | None = reducer.old_outputs
+    # As it acts: the running statistics of BatchNorm do not move, and the noise of dropout is no churn
+    with evaluation_mode(network) if has_training_mode(network) else nullcontext():
+        new = reducer.backward(reference)
+    if new is not None:
+        assert old is not None
+        changes.append(mean_absolute_change(old, new.detach()))

@@ -7,8 +7,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.algorithms.on_policy import PolicyChurnOptions, make_policy_reducer, reduced_churn
-from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.lean_forward import lean_forward
 from sb3_cchain.validation import check_bool
@@ -80,20 +79,19 @@ class CChainPPO(ChurnAlgorithm, PPO):
         self.churn_batch_size = churn_batch_size
         self.lean = lean
         check_bool("lean", lean)
-        self._churn_options()
         super().__init__(*args, **kwargs)
 
     def _churn_options(self) -> PolicyChurnOptions:
+        if self.churn_component != "full" and self.churn_target in ("value", "both"):
+            raise ValueError(
+                f'`churn_component` must be "full" unless `churn_target` is "policy", got {self.churn_component!r}'
+            )
         return PolicyChurnOptions(self.churn_base_loss, self.churn_component, self.churn_reference, self.churn_batch_size)
 
     def _setup_model(self) -> None:
         super()._setup_model()
         if self.lean:
             make_lean(self)
-
-    def _make_churn_reducer(self) -> ChurnReducer:
-        self._churn_options()  # load() does not give them to __init__()
-        return make_policy_reducer(self, self._make_churn_coefficient)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
         """
@@ -105,14 +103,6 @@ class CChainPPO(ChurnAlgorithm, PPO):
         """
         with lean_forward(self.policy) if self.lean else nullcontext():
             return super().collect_rollouts(*args, **kwargs)
-
-    def train(self) -> None:
-        """Update the policy with the current rollout, as PPO does, with churn reduction."""
-        if self.churn_reducer.coefficient.is_zero:
-            super().train()
-        else:
-            with reduced_churn(self, self.churn_reducer, self._churn_options()):
-                super().train()
 
     def learn(
         self: SelfCChainPPO,

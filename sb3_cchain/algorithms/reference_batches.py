@@ -1,7 +1,7 @@
-"""Reference batches for PPO: samples of the same rollout, outside the minibatch whose update they measure."""
+"""Reference batches of on-policy algorithms: samples of rollouts, outside the minibatch whose update they measure."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
@@ -19,9 +19,30 @@ REFERENCES = ("independent", "next")
 HELD_AT_MOST = 2**24
 
 
+class RolloutReferences(Protocol):
+    """Stands in for ``rollout_buffer.get``, and has a reference batch for each minibatch of an epoch."""
+
+    # Whether the minibatch that is being trained on is the first of its epoch
+    starts_epoch: bool
+
+    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+        """
+        :param batch_size: Minibatch size
+        :return: The minibatches of one epoch
+        """
+
+    def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> Any:
+        """
+        :param needs: What the reference batch must hold beside the observations
+        :param of_policy: Whether it is for the policy, or for the value function
+        :return: The reference batch of the minibatch that is being trained on; None where there is no other data. It consists
+            of the observations if nothing else is needed, otherwise it is a dict.
+        """
+
+
 class ReferenceBatches:
     """
-    Stands in for ``rollout_buffer.get`` and draws a reference batch for each minibatch of an epoch.
+    Draws a reference batch for each minibatch of an epoch of PPO, or of the value function of TRPO.
 
     The minibatches of an epoch are a random partition of the rollout. Whatever lies outside a minibatch is therefore a random
     sample that shares nothing with it (the paper's B_ref ∩ B_train = ∅). ``"independent"`` takes samples half an epoch away,
@@ -33,9 +54,10 @@ class ReferenceBatches:
     :param size: Size of a reference batch in minibatches; what the rollout has outside the minibatch where that is less
     """
 
-    # The reference batch of the minibatch that is being trained on, and whether that is the first of its epoch
-    current: PyTorchObs
-    starts_epoch: bool
+    # The reference batch of the minibatch that is being trained on, and whether that is the first of its epoch. None where no
+    # minibatch is being trained on
+    current: PyTorchObs | None = None
+    starts_epoch: bool = False
     # How many samples, the first ones, the minibatch and the reference batch of the one before have in common
     n_shared: int
 
@@ -50,6 +72,10 @@ class ReferenceBatches:
         :param batch_size: Minibatch size
         :return: The minibatches of one epoch
         """
+        self.current = None
+        if batch_size is None:  # TRPO's policy, which no optimiser changes
+            yield from self._get(None)
+            return
         epoch = self._draw_epoch(batch_size)
         n_samples, n_minibatches, full_size = sum(epoch.sizes), len(epoch.sizes), epoch.sizes[0]
         half_an_epoch = (n_minibatches + 1) // 2 * full_size
@@ -67,6 +93,11 @@ class ReferenceBatches:
             self.current = epoch.observations(start % n_samples, size)
             self.starts_epoch = position == 0
             yield epoch.minibatch(position)
+
+    def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> PyTorchObs | None:
+        """As of :class:`RolloutReferences`."""
+        assert not needs
+        return self.current
 
     def _draw_epoch(self, batch_size: int | None) -> "_HeldEpoch | _GatheredEpoch":
         if not self._is_sb3s():
@@ -87,6 +118,75 @@ class ReferenceBatches:
     def _n_bytes(self) -> int:
         observations = self._buffer.observations
         return sum(array.nbytes for array in (observations.values() if isinstance(observations, dict) else [observations]))
+
+
+class ReferenceMinibatches:
+    """
+    Takes another minibatch of the epoch as reference batch, half an epoch away, from any rollout buffer: with action masks, or
+    of sequences for recurrent networks, which cannot be cut. In a rollout of a single minibatch, which has no other data, the
+    minibatch is its own reference batch.
+
+    :param buffer: The rollout buffer
+    """
+
+    starts_epoch: bool = False
+
+    def __init__(self, buffer: RolloutBuffer):
+        self._get = buffer.get
+        self._sample: Any = None
+
+    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+        """
+        :param batch_size: Minibatch size
+        :return: The minibatches of one epoch
+        """
+        minibatches = list(self._get(batch_size))
+        for position, minibatch in enumerate(minibatches):
+            self._sample = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)]
+            self.starts_epoch = position == 0
+            yield minibatch
+
+    def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> Any:
+        """As of :class:`RolloutReferences`."""
+        sample = self._sample
+        if sample is None or not needs:
+            return sample and sample.observations
+        batch = {name: getattr(sample, name) for name in ("observations", *needs)}
+        if "lstm_states" in needs:
+            hidden, cell = sample.lstm_states.pi if of_policy else sample.lstm_states.vf
+            batch["lstm_states"] = {"hidden": hidden, "cell": cell}
+        return batch
+
+
+class PreviousRollout:
+    """
+    Takes the rollout before as reference batch, for A2C, which trains on each rollout as a whole and once.
+
+    :param buffer: The rollout buffer
+    :param previous: Observations of the rollout before, if it is known
+    """
+
+    starts_epoch: bool = False
+
+    def __init__(self, buffer: RolloutBuffer, previous: PyTorchObs | None):
+        self._get = buffer.get
+        self._previous = previous
+        # Observations of the rollout that is being trained on
+        self.current: PyTorchObs | None = None
+
+    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+        """
+        :param batch_size: Minibatch size
+        :return: The minibatch
+        """
+        for minibatch in self._get(batch_size):
+            self.current = minibatch.observations
+            yield minibatch
+
+    def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> PyTorchObs | None:
+        """As of :class:`RolloutReferences`."""
+        assert not needs
+        return self._previous
 
 
 class _HeldEpoch:

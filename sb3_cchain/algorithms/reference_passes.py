@@ -32,7 +32,12 @@ def separate_passes(
     """
     full = component == "full"
     with nullcontext(th.Tensor.backward) if full else component_backward(list(policy.parameters()), component) as add_gradient:
-        yield lambda: reducer.backward(references.current, add_gradient)
+
+        def add() -> None:
+            assert references.current is not None
+            reducer.backward(references.current, add_gradient)
+
+        yield add
 
 
 @contextmanager
@@ -72,6 +77,7 @@ def joint_passes(
         if churn_loss is not None:
             reducer.record(churn_loss)
             churn_loss = None
+        assert references.current is not None
         with th.no_grad():
             reducer.remember(references.current, actor_outputs(networks, references.current))
 

@@ -10,10 +10,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.model_outputs import Batch, ModelOutputs, churn, find_outputs, model_outputs
+from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, find_outputs, model_outputs
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
+from sb3_cchain.networks.batch_outputs import Batch
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number

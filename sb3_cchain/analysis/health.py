@@ -15,9 +15,9 @@ from torch import nn
 from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.metrics.rank import effective_rank, singular_values, srank
-from sb3_cchain.analysis.model_outputs import evaluation_mode
 from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.forward_hooks import forward_hooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.networks.policy_inputs import empty_memory, n_observations

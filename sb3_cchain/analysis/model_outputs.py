@@ -1,20 +1,18 @@
 """The outputs of any Stable-Baselines3 model, and how far they moved."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from torch import nn
 
 from sb3_cchain.analysis.metrics.churn import kl_divergence
-from sb3_cchain.analysis.reference_batch import Batch
 from sb3_cchain.churn.divergence import action_changes, mean_absolute_change, mean_squared_difference
-from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
-from sb3_cchain.networks.policy_outputs import distribution_outputs, policy_outputs, policy_values
+from sb3_cchain.networks.batch_outputs import Batch, PolicyKind, policy_kind
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
 
 
 @dataclass(frozen=True)
@@ -85,84 +83,22 @@ def find_outputs(model: BaseAlgorithm) -> Callable[[Any, Batch], ModelOutputs]:
     :return: Maps its policy and a batch to the outputs
     :raises TypeError: For an algorithm that is not known here
     """
-    for attributes, outputs in _KINDS.items():
-        if all(hasattr(model.policy, attribute) for attribute in attributes):
-            return outputs
-    raise TypeError(f"The outputs of {type(model).__name__} with {type(model.policy).__name__} are not known")
+    kind = policy_kind(model.policy)
+    if kind is None:
+        raise TypeError(f"The outputs of {type(model).__name__} with {type(model.policy).__name__} are not known")
+    return partial(_outputs_of_kind, kind)
 
 
-def _actor_critic_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    observations = batch["observations"]
-    if "action_masks" in batch:
-        actions = distribution_outputs(policy.get_distribution(observations, batch["action_masks"]))
-    else:
-        actions = policy_outputs(policy, observations)
-    return _with_actions(policy, actions, policy_values(policy, observations))
-
-
-def _recurrent_actor_critic_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    observations = batch["observations"]
-    episode_starts = th.zeros(n_observations(observations), device=policy.device)
-    at_the_start = empty_memory(policy, observations), episode_starts
-    distribution, _ = policy.get_distribution(observations, *at_the_start)
-    return _with_actions(policy, distribution_outputs(distribution), policy.predict_values(observations, *at_the_start))
-
-
-def _with_actions(policy: Any, actions: th.Tensor, values: th.Tensor) -> ModelOutputs:
+def _outputs_of_kind(kind: PolicyKind, policy: Any, batch: Batch) -> ModelOutputs:
+    actions = None if kind.actions is None else kind.actions(policy, batch)
+    values = None if kind.values is None else kind.values(policy, batch)
+    if values is not None and values.dim() > 2:
+        values = values.mean(dim=kind.quantiles)
+    if actions is None:
+        assert values is not None
+        return ModelOutputs(values=values, greedy_actions=values.argmax(dim=1))
     if isinstance(policy.action_space, spaces.Box):
         return ModelOutputs(action_means=actions, values=values)
+    if values is None:  # ARS, whose actor gives the actions themselves
+        return ModelOutputs(greedy_actions=actions)
     return ModelOutputs(probabilities=actions, values=values, greedy_actions=actions.argmax(dim=-1))
-
-
-def _q_network_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    return _with_greedy_actions(policy.q_net(batch["observations"]))
-
-
-def _quantile_network_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    return _with_greedy_actions(policy.quantile_net(batch["observations"]).mean(dim=1))
-
-
-def _with_greedy_actions(q_values: th.Tensor) -> ModelOutputs:
-    return ModelOutputs(values=q_values, greedy_actions=q_values.argmax(dim=1))
-
-
-def _actor_and_critics_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    observations = batch["observations"]
-    values = policy.critic(observations, batch["actions"])
-    # A tuple of (batch_size, 1), or with quantiles (batch_size, n_critics, n_quantiles)
-    values = th.cat(values, dim=1) if isinstance(values, tuple) else values.mean(dim=2)
-    return ModelOutputs(action_means=policy._predict(observations, deterministic=True), values=values)
-
-
-def _actor_outputs(policy: Any, batch: Batch) -> ModelOutputs:
-    actions = policy._predict(batch["observations"])
-    if isinstance(policy.action_space, spaces.Box):
-        return ModelOutputs(action_means=actions)
-    return ModelOutputs(greedy_actions=actions)
-
-
-# By attributes of the policy, because sb3-contrib need not be installed. The first match counts.
-_KINDS: dict[tuple[str, ...], Callable[[Any, Batch], ModelOutputs]] = {
-    ("lstm_actor",): _recurrent_actor_critic_outputs,
-    ("predict_values",): _actor_critic_outputs,
-    ("q_net",): _q_network_outputs,
-    ("quantile_net",): _quantile_network_outputs,
-    ("actor", "critic"): _actor_and_critics_outputs,
-    ("action_net",): _actor_outputs,  # ARS
-}
-
-
-@contextmanager
-def evaluation_mode(network: nn.Module) -> Iterator[None]:
-    """
-    Running BatchNorm statistics and no dropout inside the ``with`` block.
-
-    :param network: A network; each of its modules gets its mode back afterwards
-    """
-    modes = [(module, module.training) for module in network.modules()]
-    network.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training

@@ -13,7 +13,7 @@ from torch import nn
 
 from sb3_cchain.analysis.metrics.gradients import Objective, minibatch_gradients
 from sb3_cchain.analysis.metrics.ntk import gram_matrix
-from sb3_cchain.analysis.model_outputs import evaluation_mode
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
 
 
 def has_ntk(model: BaseAlgorithm) -> bool:

@@ -9,8 +9,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-# "observations", a tensor or a dict of tensors; "actions" and "action_masks" for algorithms that have them
-Batch = dict[str, Any]
+from sb3_cchain.networks.batch_outputs import Batch
 
 
 def sample_batch(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: int) -> Batch:

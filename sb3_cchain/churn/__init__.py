@@ -4,12 +4,13 @@ from sb3_cchain.churn.coefficient import AdaptiveChurnCoefficient, ChurnCoeffici
 from sb3_cchain.churn.component import component_backward, gradient_component
 from sb3_cchain.churn.divergence import cross_entropy, mean_squared_difference
 from sb3_cchain.churn.gradient import extra_gradient
-from sb3_cchain.churn.reducer import ChurnReducer
+from sb3_cchain.churn.reducer import ChurnReducer, ChurnReducers
 
 __all__ = [
     "AdaptiveChurnCoefficient",
     "ChurnCoefficient",
     "ChurnReducer",
+    "ChurnReducers",
     "component_backward",
     "cross_entropy",
     "extra_gradient",

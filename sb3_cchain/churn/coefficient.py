@@ -11,6 +11,8 @@ from sb3_cchain.validation import check_number
 
 # λ multiplies a loss in single precision
 GREATEST = th.finfo(th.float32).max
+# Beside the churn loss, as in the released code: a network that does not churn at all has no ratio
+LOSS_EPS = 1e-8
 
 
 class ChurnCoefficient(nn.Module):
@@ -50,6 +52,12 @@ class ChurnCoefficient(nn.Module):
                     f"`{name}` must be finite, got {loss}: look for NaN or infinite rewards and observations, or a learning "
                     "rate that is too high."
                 )
+
+    def problem(self) -> str | None:
+        """
+        :return: Why λ cannot do what it is for; None where it can
+        """
+        return None
 
     def reset(self) -> None:
         """Forget the losses seen, as the released code does when the task switches."""
@@ -103,9 +111,8 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         if n_seen < max(self.warmup, 1):
             return self.initial
         n_kept = min(n_seen, len(self.base_losses))
-        # 1e-8 as in the released code: a network that does not churn at all has no ratio
         base_sum, churn_sum = self.sums.tolist()
-        return max(self.target_ratio * base_sum / (churn_sum + n_kept * 1e-8), self.minimum)
+        return max(self.target_ratio * base_sum / (churn_sum + n_kept * LOSS_EPS), self.minimum)
 
     @property
     def is_zero(self) -> bool:
@@ -132,6 +139,26 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
             if slot == len(history) - 1 or forgotten > sums[index]:
                 sums[index] = buffer.sum()
         self.n_seen.add_(1)
+
+    def problem(self) -> str | None:
+        """
+        Looked for at the end of each window.
+
+        :return: Why λ cannot hold the ratio of the losses over that window; None where it can
+        """
+        n_seen, window = int(self.n_seen), len(self.base_losses)
+        if n_seen % window or n_seen < self.warmup or not n_seen:
+            return None
+        base_loss, churn_loss = (self.sums / window).tolist()
+        if base_loss <= LOSS_EPS:
+            loss = f"the loss that it is compared with is almost 0 (mean absolute value {base_loss:.2g})"
+            advice = f"churn is hardly reduced: λ is {self.value:.2g}. Give a fixed `churn_coef`, or a `churn_coef_min`"
+        elif churn_loss <= LOSS_EPS:
+            loss = f"the outputs of the network hardly change (mean churn loss {churn_loss:.2g}, no more than {LOSS_EPS:g})"
+            advice = f"λ stays at {self.value:.2g}, and `target_churn_ratio` is not reached. There may be no churn to reduce"
+        else:
+            return None
+        return f"Over {window} iterations of churn reduction, {loss}, so {advice}."
 
     def reset(self) -> None:
         """Forget the losses seen and begin a new warm-up."""

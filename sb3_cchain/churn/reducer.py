@@ -1,6 +1,7 @@
 """The churn loss of a network against itself one update ago, for any training loop."""
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,8 @@ from torch import nn
 from sb3_cchain.churn.coefficient import ChurnCoefficient
 from sb3_cchain.churn.divergence import Divergence, mean_squared_difference
 
-Observations = th.Tensor | dict[str, th.Tensor]
+# A tensor, or tensors by names; dicts nest
+Observations = th.Tensor | dict[str, Any]
 
 
 class ChurnReducer(nn.Module):
@@ -58,12 +60,15 @@ class ChurnReducer(nn.Module):
         self.coefficient = coefficient
         self.reference: Observations | None = None
         self.old_outputs: th.Tensor | None = None
+        # For a training loop that takes the next reference batch from data which it will not have any more
+        self.next_reference: Observations | None = None
         # The churn loss of each update since the last `end_iteration()`
         self.losses: list[float] = []
         # The samples since the last `end_iteration()`: their number, and the sum of their loss minus the loss without churn
         self._n_samples, self._churn_sum = 0, 0.0
+        self._has_warned = False
 
-    def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> None:
+    def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> th.Tensor | None:
         """
         Add the gradient of λ·L_churn, and remember the present outputs on ``reference`` for the next update.
 
@@ -71,15 +76,19 @@ class ChurnReducer(nn.Module):
 
         :param reference: Observations outside the minibatch of the update that is about to be made
         :param backward: Takes λ·L_churn and adds its gradient
+        :return: The present outputs on the reference batch of the update before; None where there is none
         :raises ValueError: When the churn loss, or λ times it, is NaN or infinite, or the reference batch is empty. The
             parameters and their gradients have not been touched.
         """
+        outputs = None
         if self.reference is not None:
             with th.enable_grad():
-                loss = self.loss(self._outputs[0](self.reference))
+                outputs = self._outputs[0](self.reference)
+                loss = self.loss(outputs)
             if loss.requires_grad:  # not all that the outputs depend on is frozen
                 backward(loss)
         self.remember(reference)
+        return outputs
 
     def loss(self, new_outputs: th.Tensor) -> th.Tensor:
         """
@@ -137,17 +146,26 @@ class ChurnReducer(nn.Module):
         """
         return self._churn_sum / self._n_samples if self._n_samples else float("nan")
 
-    def end_iteration(self, base_loss: float) -> None:
+    def end_iteration(self, base_loss: float, each_update: bool = False) -> None:
         """
         Adapt λ to the losses since the last call. Without an update in between, nothing happens.
 
+        Warns once when, over a whole window, λ could not hold the churn loss at its ratio to the base loss.
+
         :param base_loss: The mean over these updates of the loss that the churn loss was added to
+        :param each_update: Whether each update counts as an iteration of λ's warm-up and window, instead of all of them as one
         :raises ValueError: When it is NaN or infinite
         """
         losses = self.losses
         self.discard_losses()
-        if losses:
-            self.coefficient.update(base_loss, sum(losses) / len(losses))
+        if not losses:
+            return
+        for churn_loss in losses if each_update else [sum(losses) / len(losses)]:
+            self.coefficient.update(base_loss, churn_loss)
+            problem = None if self._has_warned else self.coefficient.problem()
+            if problem is not None:
+                self._has_warned = True
+                warnings.warn(problem)
 
     def discard_losses(self) -> None:
         """Forget the losses since the last ``end_iteration()``, as when training was interrupted in between."""
@@ -162,18 +180,15 @@ class ChurnReducer(nn.Module):
         """
         :param device: The device of the network; a state that was loaded may come from another one
         """
-        if isinstance(self.reference, dict):
-            self.reference = {key: tensor.to(device) for key, tensor in self.reference.items()}
-        elif self.reference is not None:
-            self.reference = self.reference.to(device)
-        if self.old_outputs is not None:
-            self.old_outputs = self.old_outputs.to(device)
+        for name in ("reference", "old_outputs", "next_reference"):
+            setattr(self, name, _moved(getattr(self, name), device))
 
     def get_extra_state(self) -> dict[str, Any]:
         """
         :return: What ``state_dict()`` holds besides the buffers
         """
-        return {"reference": self.reference, "old_outputs": self.old_outputs}
+        state = {"reference": self.reference, "old_outputs": self.old_outputs}
+        return state if self.next_reference is None else {**state, "next_reference": self.next_reference}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """
@@ -181,6 +196,39 @@ class ChurnReducer(nn.Module):
         """
         self.reference = state["reference"]
         self.old_outputs = state["old_outputs"]
+        self.next_reference = state.get("next_reference")
+
+
+class ChurnReducers(nn.ModuleDict):
+    """Churn reducers by the name of what they hold still: ``"policy"``, ``"value"`` or both."""
+
+    def __getitem__(self, key: str) -> ChurnReducer:
+        reducer = super().__getitem__(key)
+        assert isinstance(reducer, ChurnReducer)
+        return reducer
+
+    def values(self) -> list[ChurnReducer]:  # type: ignore[override]
+        """
+        :return: The reducers
+        """
+        return [self[name] for name in self]
+
+    @property
+    def first(self) -> ChurnReducer:
+        """The only reducer, or the first of several."""
+        return self[next(iter(self))]
+
+    def active(self) -> dict[str, ChurnReducer]:
+        """
+        :return: Those with a λ that is not, and stays, 0
+        """
+        return {name: self[name] for name in self if not self[name].coefficient.is_zero}
+
+
+def _moved(value: Any, device: th.device | str) -> Any:
+    if isinstance(value, dict):
+        return {key: _moved(each, device) for key, each in value.items()}
+    return None if value is None else value.to(device)
 
 
 def _check_finite(loss: float, coef: float, greatest: float) -> None:

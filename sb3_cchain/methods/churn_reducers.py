@@ -9,9 +9,9 @@ from sb3_cchain.tasks.callback_tree import iterate_callbacks
 def churn_reducers(callback: BaseCallback) -> list[ChurnReducer]:
     """
     :param callback: A callback, during ``learn()``
-    :return: The churn reducers of that training: of the model (``CChainPPO``, ``CChainDQN``), or of another callback
+    :return: The churn reducers of that training: of the model (``CChainPPO`` and others), or of another callback
         (``CChainCallback``). A method that changes the network between two updates makes them forget their reference batch,
         because only changes by updates are churn; otherwise C-CHAIN would undo the change.
     """
     holders = [callback.model, *iterate_callbacks(callback.locals.get("callback"))]
-    return [holder.churn_reducer for holder in holders if hasattr(holder, "churn_reducer")]
+    return [reducer for holder in holders for reducer in getattr(holder, "churn_reducers", {}).values()]

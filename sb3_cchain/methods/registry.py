@@ -5,8 +5,9 @@ The command line, the search spaces, the benchmark, its report, its curves and i
 method, add a row, its YAML file and its page; the tests say what is missing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 from stable_baselines3 import PPO
@@ -14,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
+from sb3_cchain.algorithms import CChainA2C, CChainDDPG, CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
@@ -75,7 +76,32 @@ class Method:
 
 
 PPO_SUITES = ("gym_control", "procgen", "dmc")
-OPTIMIZER_PAGE, PLASTICITY_PAGE = "modules/optimizers", "modules/plasticity"
+OPTIMIZER_PAGE, PLASTICITY_PAGE, FAMILY_PAGE = "modules/optimizers", "modules/plasticity", "modules/family"
+
+
+def _family() -> Iterator[Method]:
+    """The other algorithms of SB3 with churn reduction, and those of sb3-contrib where it is installed."""
+    algorithms: dict[str, type[BaseAlgorithm]] = {
+        "a2c": CChainA2C,
+        "ddpg": CChainDDPG,
+        "sac": CChainSAC,
+        "td3": CChainTD3,
+    }
+    if find_spec("sb3_contrib") is not None:
+        from sb3_cchain.algorithms import contrib
+
+        algorithms |= {
+            "crossq": contrib.CChainCrossQ,
+            "ppo_lstm": contrib.CChainRecurrentPPO,
+            "ppo_mask": contrib.CChainMaskablePPO,
+            "qrdqn": contrib.CChainQRDQN,
+            "tqc": contrib.CChainTQC,
+            "trpo": contrib.CChainTRPO,
+        }
+    for name, algorithm in algorithms.items():
+        label = f"C-CHAIN {algorithm.__name__.removeprefix('CChain')}"
+        yield Method("cchain", f"{name}_cchain", algorithm, label, "tab:blue", FAMILY_PAGE)
+
 
 # In the order of the report's tables
 REGISTRY = (
@@ -138,6 +164,7 @@ REGISTRY = (
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
+    *_family(),
 )
 
 METHOD_NAMES = tuple(dict.fromkeys(method.name for method in REGISTRY))

@@ -26,6 +26,8 @@ from sb3_cchain.networks.policy_networks import PolicyNetworks
 _MODE_FREE_PACKAGES = (
     "stable_baselines3.",
     "sb3_cchain.",
+    # Not `common.torch_layers`, which has BatchRenorm
+    *(f"sb3_contrib.{package}." for package in ("common.maskable", "common.recurrent", "crossq", "qrdqn", "tqc")),
     "torch._dynamo.eval_frame",  # what torch.compile() wraps around a module
     "torch.nn.modules.activation",
     "torch.nn.modules.container",
@@ -34,6 +36,7 @@ _MODE_FREE_PACKAGES = (
     "torch.nn.modules.linear",
     "torch.nn.modules.normalization",
     "torch.nn.modules.pooling",
+    "torch.nn.modules.rnn",
 )
 _MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
 
@@ -143,7 +146,9 @@ def has_training_mode(policy: nn.Module) -> bool:
         a module that is not known here
     """
     return any(
-        not type(module).__module__.startswith(_MODE_FREE_PACKAGES) or isinstance(module, _MODE_DEPENDENT_MODULES)
+        not type(module).__module__.startswith(_MODE_FREE_PACKAGES)
+        or isinstance(module, _MODE_DEPENDENT_MODULES)
+        or (isinstance(module, nn.RNNBase) and module.dropout > 0)
         for module in policy.modules()
     )
 

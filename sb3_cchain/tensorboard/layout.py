@@ -23,9 +23,10 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Policy churn of an update": "churn/policy_churn",
         "Value churn of an update": "churn/value_churn",
         "Greedy actions that an update changes, share": "churn/greedy_action_changes",
-        "Churn loss": "churn/loss",
-        "λ": "churn/coef",
-        "λ · churn loss / base loss": "churn/relative_loss",
+        # With several targets, one of each
+        "Churn loss": "churn/((policy|value)/)?loss",
+        "λ": "churn/((policy|value)/)?coef",
+        "λ · churn loss / base loss": "churn/((policy|value)/)?relative_loss",
     },
     "Churn, monitored": {
         "Policy churn": "churn_monitor/(fixed|fresh)/policy_churn",

@@ -7,12 +7,15 @@ import optuna
 from rl_zoo3 import ALGOS, hyperparams_opt
 from rl_zoo3.hyperparams_opt import convert_offpolicy_params, sample_her_params
 from rl_zoo3.utils import get_class_by_name
+from sb3_contrib import CrossQ, MaskablePPO
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.algorithms import DoubleDQN
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.reference_batches import REFERENCES
+from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.methods.registry import REGISTRY, Method
 
 # Arguments: Optuna's trial, the dimension of continuous actions (0 for others), the number of environments, and RL Zoo's
@@ -69,25 +72,31 @@ def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sa
     """
     :param sampler: Search space of the algorithm without churn reduction
     :param algorithm: An algorithm with churn reduction
-    :return: The same search space, β, a decade beyond the paper's values on either side, and where the reference batches are
-        taken from. With PPO also their size.
+    :return: The same search space and β, a decade beyond the papers' values on either side. With PPO and DQN also where the
+        reference batches are taken from, and with PPO their size.
     """
+    kind = churn_kind(algorithm)
+    target = kind.targets[kind.default]
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
         sampled = sampler(trial, n_actions, n_envs, additional_args)
-        if not issubclass(algorithm, OnPolicyAlgorithm):
-            low, high = 1e-3, 1e-1  # around 0.01
-        elif n_actions > 0:
-            low, high = 5e-3, 5.0  # around 0.05 to 0.5
-        else:
-            low, high = 1e2, 1e6  # around 1e3 to 1e5
+        low, high = _BETAS[target.target_ratios[cross_entropy if _is_discrete(target, n_actions) else mean_squared_difference]]
         sampled["target_churn_ratio"] = trial.suggest_float("target_churn_ratio", low, high, log=True)
-        sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
-        if issubclass(algorithm, OnPolicyAlgorithm):
+        if issubclass(algorithm, (PPO, DQN)):
+            sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
+        if issubclass(algorithm, PPO):
             sampled["churn_batch_size"] = trial.suggest_categorical("churn_batch_size", [0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
         return sampled
 
     return sample
+
+
+# By the default: a decade beyond the values of the papers and their code on either side
+_BETAS = {1e4: (1e2, 1e6), 0.05: (5e-3, 5.0), 0.01: (1e-3, 1e-1), 5e-5: (5e-6, 5e-4)}
+
+
+def _is_discrete(target: ChurnTarget, n_actions: int) -> bool:
+    return n_actions == 0 and cross_entropy in target.target_ratios
 
 
 def refuse_trial(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -102,6 +111,9 @@ def refuse_trial(sampled_params: dict[str, Any]) -> dict[str, Any]:
 _SEARCH_SPACES: dict[type[BaseAlgorithm], tuple[Sampler, Converter]] = {
     **{ALGOS[name]: (HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name]) for name in HYPERPARAMS_SAMPLER},
     DoubleDQN: (sample_double_dqn_params, convert_double_dqn_params),
+    # RL Zoo has none of these. Of CrossQ, β alone is searched
+    MaskablePPO: (HYPERPARAMS_SAMPLER["ppo"], HYPERPARAMS_CONVERTER["ppo"]),
+    CrossQ: (lambda *_: {}, dict),
 }
 _RL_ZOO_NAMES = frozenset(HYPERPARAMS_SAMPLER)
 

@@ -1,0 +1,22 @@
+"""TQC with churn reduction."""
+
+from sb3_contrib import TQC
+
+from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
+
+
+class CChainTQC(ChurnAlgorithm, TQC):
+    """
+    Truncated Quantile Critics (TQC) with Continual Churn Approximated Reduction (C-CHAIN).
+
+    It is sb3-contrib's :class:`~sb3_contrib.TQC`, with all of its arguments and its ``train()`` unchanged, plus
+    λ·L_churn in the losses of each update.
+
+    By default the actor's actions without noise are held still (``churn_target="policy"``), by their mean squared
+    change on a sample of the replay buffer; ``"value"`` holds still each critic's quantiles of the values of the
+    actions of such a sample.
+
+    :param args: Arguments of TQC
+    :param kwargs: Keyword arguments of TQC, and the arguments for churn reduction:
+        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+    """
