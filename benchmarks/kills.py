@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algo", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS), help="What is trained")
     parser.add_argument("--kills", type=int, default=100, help="How often each training is killed")
-    parser.add_argument("--steps", type=int, default=30_000, help="Environment steps of a training")
+    parser.add_argument("--steps", type=int, default=60_000, help="Environment steps of a training")
     parser.add_argument("--save-freq", type=int, default=128, help="Environment steps between checkpoints")
     parser.add_argument("--longest", type=float, default=3.0, help="Seconds after which it is killed at the latest")
     parser.add_argument("--seed", type=int, default=0, help="Of the moments")

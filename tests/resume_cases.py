@@ -24,17 +24,20 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, TaskSync
+from sb3_cchain.algorithms.churn_targets import churn_kind
 from sb3_cchain.analysis import NetworkHealth, NTKCallback
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, find_checkpoint, resume
+from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.envs import ContinualProcgenVecEnv, TaskVecNormalize
-from sb3_cchain.methods.registry import REGISTRY
+from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
 from tests.method_models import make_callback, nested_optimizers, optimizer_arguments
 
 # Another one in each process, so that nothing goes on well because it began alike
@@ -200,8 +203,25 @@ def method_case(method):
     )
 
 
+def family_case(method):
+    """C-CHAIN for another algorithm than PPO and DQN."""
+    name = method.algorithm.__name__.removeprefix("CChain")
+    env = {"MaskablePPO": vec_env(MaskedCartPole), **dict.fromkeys(("A2C", "TRPO", "RecurrentPPO", "QRDQN"), CARTPOLE)}
+    given = {**(ON_POLICY if issubclass(method.algorithm, OnPolicyAlgorithm) else OFF_POLICY), **CHURN, "churn_target": "auto"}
+    if "policy" in churn_kind(method.algorithm).targets:
+        given["churn_target"] = "both"
+    allowed = constructor_arguments(method.algorithm)
+    return Case(
+        *(method.algorithm, env.get(name, PENDULUM), {key: value for key, value in given.items() if key in allowed}),
+        policy="MlpLstmPolicy" if name == "RecurrentPPO" else method.policy,
+        learn=dict(log_interval=1),
+        package="sb3_contrib",
+    )
+
+
 CASES = {
-    **{f"{method.algo} cartpole": method_case(method) for method in REGISTRY},
+    **{f"{method.algo} cartpole": method_case(method) for method in REGISTRY if method.page != FAMILY_PAGE},
+    **{method.algo: family_case(method) for method in REGISTRY if method.page == FAMILY_PAGE},
     # Continual environments
     "CChainPPO acrobot": Case(
         *(CChainPPO, vec_env("Continual/Acrobot-v1", **ACROBOT), {**ON_POLICY, **CHURN, "churn_reference": "next"}),

@@ -15,7 +15,7 @@ class TensorBoardOverview(BaseCallback):
     There are charts of returns, C-CHAIN, monitored churn, the NTK, network health and related methods, as far as they are
     logged. The hyperparameters are the arguments of the model, and the names of its algorithm, policy and environment.
 
-    The algorithms with churn reduction, ``CChainCallback``, ``ContinualMetrics`` and all callbacks that look at networks during
+    The algorithms with churn reduction, ``CChainCallback``, ``ContinualMetrics`` and all callbacks that look at networks in
     training do the same by themselves, so give it to other algorithms without those callbacks. It does nothing twice, and
     nothing for a model that does not log to TensorBoard. Hyperparameters that the user logs by SB3's ``HParam`` take the place
     of these.
