@@ -486,3 +486,25 @@ def test_replay_needs_no_episode():
     env, new = EpisodeReplay(Opaque()), EpisodeReplay(Opaque())
     new.load_state_dict(env.state_dict())
     assert new.is_recorded
+
+
+class World:
+    """Moves when it is told to."""
+
+    position = 0.0
+
+
+class SharedWorldEnv(gym.Env):
+    """Reaches its world by two ways, one of which is a list."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self):
+        self.world = World()
+        self.players = [self.world]
+
+
+def test_refuses_objects_that_would_be_several():
+    with pytest.raises(ValueError, match="SharedWorldEnv.*world.*another attribute refers to.*`state_dict\\(\\)`"):
+        prepare_environment(DummyVecEnv([SharedWorldEnv]))

@@ -374,7 +374,7 @@ class Changed(gym.Wrapper):
     "kwargs, message",
     [
         (dict(n_envs=2), "number of environments was 1 and is 2"),
-        (dict(wrapper_class=Changed), "environment was <.*> and is <Changed<"),
+        (dict(wrapper_class=Changed), r"environment was CartPole-v1 \(.*\) and is CartPole-v1 \(Changed "),
     ],
     ids=["number", "wrappers"],
 )

@@ -117,6 +117,8 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
     :raises ValueError: When there is none, or the one given is damaged
     """
     path = Path(path)
+    if not path.is_dir():
+        raise ValueError(f"{path} is not a checkpoint of a training, nor a folder of checkpoints: there is no such folder")
     candidates = _step_folders(path)
     if not candidates:
         try:

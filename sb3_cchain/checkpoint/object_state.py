@@ -85,6 +85,10 @@ class NotSaved(ValueError):
     """An attribute that a state needs cannot be saved."""
 
 
+class SharedObject(NotSaved):
+    """An object is reached by several ways, one of them through a container, and would be several when it is put back."""
+
+
 class Data(NamedTuple):
     """
     A value that is copied as a whole.
@@ -214,6 +218,8 @@ class _Reader:
         self._numbers: dict[int, int] = {}
         self._met: list[object] = []
         self._packages: set[str] = set()
+        # With `strict`, the objects that were met inside of containers, by id
+        self._inside: dict[int, object] = {}
 
     def holder(self, holder: object, name: str, skip: Collection[str]) -> Any:
         self._packages = {"sb3_cchain", *map(_package, type(holder).__mro__)} - {"builtins"}
@@ -240,6 +246,8 @@ class _Reader:
             return Known(self._known[id(value)])
         if id(value) in self._numbers:
             return Same(self._numbers[id(value)])
+        if id(value) in self._inside:
+            raise SharedObject(f"{path}: a container that another attribute refers to holds this object, too")
         own = _own_state(value)
         if own is not None:
             return StateDict(self._number(value), self._pickled(own.read(value)))
@@ -251,7 +259,8 @@ class _Reader:
             return self._data(value)
         except Exception as error:  # whatever the object's own code raises
             if self._strict:
-                raise NotSaved(f"{path}: {error}") from error
+                kind = SharedObject if isinstance(error, SharedObject) else NotSaved
+                raise kind(f"{path}: {error}") from error
             self._left_out.append(path)
             return None
 
@@ -277,7 +286,13 @@ class _Reader:
                 parts[self._number(part)] = content
             return self._numbers[id(part)]
 
-        _DataPickler(file, self._known, refer).dump(value)
+        def meet(part: Any) -> None:
+            if part is not value and _is_shareable(part):
+                if id(part) in self._numbers:
+                    raise SharedObject("it holds an object that another attribute refers to, too")
+                self._inside[id(part)] = part
+
+        _DataPickler(file, self._known, refer, meet if self._strict else None).dump(value)
         return Data(self._number(value), file.getvalue(), parts)
 
     def _number(self, value: Any) -> int:
@@ -388,13 +403,18 @@ class KnownUnpickler(pickle.Unpickler):
 
 
 class _DataPickler(KnownPickler):
-    def __init__(self, file: Any, known: Mapping[int, str], refer: Callable[[Any], int | None]):
+    def __init__(
+        self, file: Any, known: Mapping[int, str], refer: Callable[[Any], int | None], meet: Callable[[Any], None] | None
+    ):
         super().__init__(file, known)
         self._refer = refer
+        self._meet = meet
 
     def persistent_id(self, value: Any) -> Any:
         # Called for every number in it
         name = self._known.get(id(value))
+        if name is None and self._meet is not None:
+            self._meet(value)
         return self._refer(value) if name is None and type(value) in _COPY_INTO else name
 
     def reducer_override(self, value: Any) -> Any:
@@ -433,6 +453,13 @@ def _own_state(value: object) -> _OwnState | None:
     if hasattr(kind, "state_dict") and hasattr(kind, "load_state_dict"):
         return _OwnState(kind, kind.state_dict, kind.load_state_dict)
     return next((own for own in _OWN_STATES if isinstance(value, own.kind)), None)
+
+
+def _is_shareable(value: object) -> bool:
+    """Whether it matters that a value stays one where several refer to it: it can change, and no rule of its type copies it."""
+    if type(value) in _COPY_INTO or isinstance(value, (*KEPT, Enum, spaces.Space)):
+        return False
+    return isinstance(value, (list, dict, set, np.ndarray)) or hasattr(value, "__dict__")
 
 
 def _package(kind: type) -> str:

@@ -11,7 +11,7 @@ from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.object_state import NotSaved, object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import NotSaved, SharedObject, object_states, restore_objects
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.envs.continual_env import ContinualEnv
 
@@ -264,6 +264,12 @@ def _fault(env: gym.Env, layer: gym.Env) -> str | None:
         # What MuJoCo's data are is known
         with emptied(layers.values()):
             object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=True)
+    except SharedObject as error:
+        # Neither would an episode that is played again be the same, as it begins with the attributes of that time
+        raise ValueError(
+            f"{layer} cannot be resumed, because its state cannot be saved: {error}. Give its class `state_dict()` and "
+            "`load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
+        ) from error
     except NotSaved as error:
         return str(error)
     return None

@@ -3,20 +3,23 @@
 import importlib
 from pathlib import Path
 
+import gymnasium as gym
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
+from sb3_cchain.validation import check_number
 
 
 def resume(
     path: str | Path,
-    env: GymEnv,
+    env: GymEnv | str,
     callback: MaybeCallback = None,
     *,
     total_timesteps: int | None = None,
@@ -31,17 +34,22 @@ def resume(
     the interruption; their state comes from the checkpoint. Further checkpoints go to the same folder.
 
     :param path: A checkpoint, or the folder of checkpoints, whose newest whole one is taken
-    :param env: The environment, made as before
+    :param env: The environment, made as before, or its id
     :param callback: The callbacks that were given to ``learn()``, made as before and in the same order. The former
         TrainingCheckpoint may be left out where it was the last
     :param total_timesteps: Environment steps at which training ends, those before the interruption included; by default as
         before
-    :param logger: The logger; by default the model logs as it did, to the same folder for TensorBoard
+    :param logger: The logger. By default the model logs to the screen and to its folder for TensorBoard, if it has one. A
+        logger of another kind has to be given again, with a new folder, as SB3's CSV file starts anew
     :param device: PyTorch device
     :return: The trained model
     :raises ValueError: When there is no whole checkpoint, when the training was at its end already, or naming what differs
         from the training that was saved
     """
+    if env is None or (callable(env) and not isinstance(env, (gym.Env, VecEnv))):
+        raise ValueError(f"`env` must be an environment, a vectorised environment or an environment id, got {env!r}")
+    if total_timesteps is not None:
+        check_number("total_timesteps", total_timesteps, 1, integer=True)
     checkpoint = find_checkpoint(path)
     remaining = (checkpoint.total_timesteps if total_timesteps is None else total_timesteps) - checkpoint.num_timesteps
     if remaining <= 0:
@@ -49,7 +57,9 @@ def resume(
             f"`total_timesteps` must be more than {checkpoint.num_timesteps}, the steps that the model in {checkpoint.path} "
             f"was trained for; got {total_timesteps or checkpoint.total_timesteps}"
         )
-    model = load_model(checkpoint, env, device)
+    made = maybe_make_env(env, verbose=0)
+    assert made is not None
+    model = load_model(checkpoint, made, device)
     if logger is None and model.tensorboard_log is not None and checkpoint.info["log_folder"] is not None:
         logger = configure(checkpoint.info["log_folder"], ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
     if logger is not None:

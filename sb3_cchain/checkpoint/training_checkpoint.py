@@ -12,6 +12,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,6 +24,7 @@ from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.validation import check_bool, check_number
 
+DIFFERENT = "Make the training as it was, or load the model as usual, which begins new episodes."
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -34,7 +36,8 @@ class TrainingCheckpoint(BaseCallback):
     It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were
     made, and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it
     ends the training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and
-    learned from before that. A second signal ends the training at once.
+    learned from before that. A second signal ends the training at once. In the last rollout of a training, the first signal
+    changes nothing: training is complete then.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
     the same rhythm; when it is told to stop, it does not wait.
@@ -46,6 +49,7 @@ class TrainingCheckpoint(BaseCallback):
     :param keep: How many checkpoints stay
     :param exact: Whether environments that cannot be resumed in the middle of an episode are refused. Otherwise all
         environments begin new episodes when training is resumed
+    :raises TypeError: When training starts, for ARS
     :raises ValueError: Naming the argument that is out of its range. When training starts: for environments that cannot be
         resumed exactly, a folder of another training, or a second TrainingCheckpoint
     """
@@ -117,6 +121,20 @@ class TrainingCheckpoint(BaseCallback):
         self._last_saved = state["last_saved"]
         self.num_timesteps, self.n_calls = state["num_timesteps"], state["n_calls"]
 
+    def _init_callback(self) -> None:
+        if self.parent is not None:
+            raise ValueError(
+                f"TrainingCheckpoint acts between rollouts: give it to `learn()` itself, not to {type(self.parent).__name__}"
+            )
+        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+            raise TypeError(
+                f"TrainingCheckpoint is for on-policy and off-policy algorithms, got {type(self.model).__name__}, which has "
+                "no rollouts"
+            )
+        if self._resumed is not None:
+            # Before other callbacks change hyperparameters when training starts
+            check_same(self._resumed.info["model"], describe_model(self.model), DIFFERENT)
+
     def _on_training_start(self) -> None:
         require_single(self)
         self._release()  # what training that was ended by an error left
@@ -148,9 +166,7 @@ class TrainingCheckpoint(BaseCallback):
     def _check_resumed(self, checkpoint: Checkpoint) -> None:
         checkpoint.warn_of_other_versions()
         saved = checkpoint.info
-        advice = "Make the training as it was, or load the model as usual, which begins new episodes."
-        check_same(saved["environment"], self._environment, advice)
-        check_same(saved["model"], describe_model(self.model), advice)
+        check_same(saved["environment"], self._environment, DIFFERENT)
         check_same(saved["callbacks"], describe_callbacks(self._parts.callbacks), "Give the same callbacks in the same order.")
 
     def _on_rollout_start(self) -> None:
@@ -171,6 +187,8 @@ class TrainingCheckpoint(BaseCallback):
         self._n_rollouts += 1
 
     def _on_training_end(self) -> None:
+        if self._stop_signal is not None:
+            print("That was the last rollout: training is complete, and goes on to what comes after it", flush=True)
         self._release()
 
     def _is_due(self) -> bool:
