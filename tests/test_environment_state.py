@@ -506,5 +506,5 @@ class SharedWorldEnv(gym.Env):
 
 
 def test_refuses_objects_that_would_be_several():
-    with pytest.raises(ValueError, match="SharedWorldEnv.*world.*another attribute refers to.*`state_dict\\(\\)`"):
+    with pytest.raises(ValueError, match=r"SharedWorldEnv.*players.*another attribute refers to.*`state_dict\(\)`"):
         prepare_environment(DummyVecEnv([SharedWorldEnv]))

@@ -456,7 +456,7 @@ def _own_state(value: object) -> _OwnState | None:
 
 
 def _is_shareable(value: object) -> bool:
-    """Whether it matters that a value stays one where several refer to it: it can change, and no rule of its type copies it."""
+    """Whether it matters that a value stays one where several refer to it: it can change, and its type has no rule."""
     if type(value) in _COPY_INTO or isinstance(value, (*KEPT, Enum, spaces.Space)):
         return False
     return isinstance(value, (list, dict, set, np.ndarray)) or hasattr(value, "__dict__")
