@@ -132,6 +132,9 @@ class ChurnKind:
 # cross-entropy of discrete policies, 0.05 or 0.5 with the mean squared difference of action means, and 0.01 with action values
 _OF_POLICIES: dict[Divergence, float] = {cross_entropy: 1e4, mean_squared_difference: 0.05}
 _OF_VALUES: dict[Divergence, float] = {mean_squared_difference: 0.01}
+# A2C's policy loss, of advantages that are not normalised, is about a hundred times PPO's clipped surrogate, which is near 0.
+# With PPO's β it learns nothing (docs/modules/family.md)
+_OF_A2C: dict[Divergence, float] = {cross_entropy: 10.0, mean_squared_difference: 5e-5}
 # Released code of Tang and Berseth (NeurIPS 2024) for TD3
 _OF_ACTIONS: dict[Divergence, float] = {mean_squared_difference: 5e-5}
 
@@ -144,6 +147,7 @@ _POLICY = ChurnTarget(actor_critic_actions, _PPO_LOSSES, _OF_POLICIES, policy_di
 _VALUE = ChurnTarget(actor_critic_values, _VALUE_LOSS, _OF_VALUES)
 _ACTOR = ChurnTarget(deterministic_actions, {"train/actor_loss": None}, _OF_ACTIONS, optimizer="actor")
 _CRITIC = ChurnTarget(critic_values, {"train/critic_loss": None}, _OF_VALUES, optimizer="critic", needs=("actions",))
+_VALUE_OF_A2C = ChurnTarget(actor_critic_values, _VALUE_LOSS, {mean_squared_difference: 1e-3})
 _ACTOR_CRITIC = ChurnKind({"policy": _ACTOR, "value": _CRITIC}, default="policy")
 _NO_POLICY = "it has no policy of its own: its actions follow from the values"
 
@@ -170,7 +174,8 @@ KINDS = {
     ),
     # One update in each iteration
     "A2C": ChurnKind(
-        {"policy": ChurnTarget(actor_critic_actions, _A2C_LOSSES, _OF_POLICIES, policy_divergence), "value": _VALUE}, "policy"
+        {"policy": ChurnTarget(actor_critic_actions, _A2C_LOSSES, _OF_A2C, policy_divergence), "value": _VALUE_OF_A2C},
+        "policy",
     ),
     "TRPO": ChurnKind(
         {"value": ChurnTarget(actor_critic_values, {"train/value_loss": None}, _OF_VALUES)},
