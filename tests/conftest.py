@@ -1,5 +1,10 @@
+import signal
+
 import pytest
 import torch as th
+
+# A shell has the commands that it runs in the background ignore Ctrl-C, which processes that tests start would inherit
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)

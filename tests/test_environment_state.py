@@ -36,6 +36,7 @@ from sb3_cchain.checkpoint.episode_replay import EpisodeReplay
 from sb3_cchain.checkpoint.object_state import object_state, restore_object
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
 from sb3_cchain.checkpoint.simulator_state import register_simulators
+from sb3_cchain.checkpoint.training_description import describe_env
 from sb3_cchain.envs import ContinualProcgenVecEnv, TaskVecNormalize
 from tests.envs import CountEnv, RandomEnv
 
@@ -508,3 +509,26 @@ class SharedWorldEnv(gym.Env):
 def test_refuses_objects_that_would_be_several():
     with pytest.raises(ValueError, match=r"SharedWorldEnv.*players.*another attribute refers to.*`state_dict\(\)`"):
         prepare_environment(DummyVecEnv([SharedWorldEnv]))
+
+
+def test_rl_zoos_time_limit_is_gymnasiums():
+    """RL Zoo replaces the class when it is imported, so training with and without it has another one."""
+    pytest.importorskip("rl_zoo3")
+    plain = gym.wrappers.TimeLimit.__mro__[1]
+    assert plain.__module__.startswith("gymnasium.")
+
+    def make_with(kind):
+        def make_one():
+            return kind(gym.make("CartPole-v1", max_episode_steps=-1), 20)
+
+        return DummyVecEnv([make_one])
+
+    saved, other = begin(make_with(plain)), make_with(gym.wrappers.TimeLimit)
+    assert describe_env(saved) == describe_env(other)
+    saved.step([0])
+    state = environment_state(saved)
+    expected = [saved.step([step % 2])[0] for step in range(40)]
+    other.reset()
+    restore_environment(other, state)
+    np.testing.assert_array_equal([other.step([step % 2])[0] for step in range(40)], expected)
+    assert type(other.envs[0]) is gym.wrappers.TimeLimit

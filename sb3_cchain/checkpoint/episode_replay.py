@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cchain.checkpoint.object_state import object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import object_states, restore_objects, stock_class
 
 # How environments and wrappers were made
 CONSTRUCTION = frozenset({"_cached_spec", "_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs", "mujoco_renderer"})
@@ -116,7 +116,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         while isinstance(env, gym.Wrapper):
             env = env.env
             layers.append(env)
-        return {f"{position} {type(layer).__name__}": layer for position, layer in enumerate(layers)}
+        return {f"{position} {stock_class(type(layer)).__name__}": layer for position, layer in enumerate(layers)}
 
     def _known(self) -> dict[str, object]:
         return {"replay": self}

@@ -466,7 +466,16 @@ def _package(kind: type) -> str:
     return str(getattr(kind, "__module__", "")).partition(".")[0]  # some classes of C extensions have none
 
 
+def stock_class(kind: type) -> type:
+    """
+    :param kind: A class
+    :return: It, or Gymnasium's ``TimeLimit`` for the one that RL Zoo puts in its place as soon as it is imported
+    """
+    return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
+
+
 def _class_name(kind: type) -> str:
+    kind = stock_class(kind)
     return f"{kind.__module__}:{kind.__qualname__}"
 
 

@@ -11,7 +11,7 @@ from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.object_state import NotSaved, SharedObject, object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import NotSaved, SharedObject, object_states, restore_objects, stock_class
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.envs.continual_env import ContinualEnv
 
@@ -76,6 +76,12 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         # What a reset adds may need to be recorded, too
         return self._fault or attempt(make_resumable, self)[0]
+
+    def description(self) -> str:
+        """
+        :return: See :func:`describe_single_environment`
+        """
+        return describe_single_environment(self)
 
     def can_save(self) -> bool:
         """
@@ -158,6 +164,19 @@ def _may_have_begun(chain: Sequence[gym.Env]) -> bool:
     return all(layer.has_reset for layer in chain if isinstance(layer, OrderEnforcing))
 
 
+def describe_single_environment(env: gym.Env) -> str:
+    """
+    :param env: An environment
+    :return: Its id and the classes of its wrappers, from outside to inside; its own words may tell its state
+    """
+    spec, names = env.spec, []
+    while isinstance(env, gym.Wrapper):
+        if not isinstance(env, EpisodeReplay):  # which is put in when training starts
+            names.append(stock_class(type(env)).__name__)
+        env = env.env
+    return f"{spec.id if spec is not None else 'without id'} ({' '.join([*names, type(env).__name__])})"
+
+
 def can_save_single_environment(env: gym.Env) -> bool:
     """
     :param env: An environment that :func:`make_resumable` returned
@@ -224,7 +243,7 @@ def _layers(env: gym.Env, prefix: str = "") -> dict[str, gym.Env]:
     """All that has a state of its own, with the tasks of a continual environment."""
     chain = _chain(env)
     kept = [layer for layer in chain if not isinstance(layer, ResumableEnv)]
-    layers = {f"{prefix}{position} {type(layer).__name__}": layer for position, layer in enumerate(kept)}
+    layers = {f"{prefix}{position} {stock_class(type(layer)).__name__}": layer for position, layer in enumerate(kept)}
     if isinstance(chain[-1], ContinualEnv):
         for task_id, task in enumerate(chain[-1].tasks):
             layers.update(_layers(task, f"{prefix}task {task_id}, "))

@@ -4,11 +4,12 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from sb3_cchain.checkpoint.resumable_env import ResumableEnv, describe_single_environment
 
 # Arguments that do not change what is learned, are described by themselves, or are changed by callbacks
 _OTHER_ARGUMENTS = frozenset(
@@ -52,10 +53,10 @@ def describe_env(env: VecEnv) -> dict[str, str]:
         layer = layer.venv
         layers.append(type(layer).__name__)
     if isinstance(layer, DummyVecEnv):
-        name = _single_name(layer.envs[0])
-    elif isinstance(layer, SubprocVecEnv):
-        name = env.env_method("__str__", indices=0)[0]
-    else:  # not made of single environments
+        name = describe_single_environment(layer.envs[0])
+    elif isinstance(layer, SubprocVecEnv) and all(env.env_is_wrapped(ResumableEnv)):
+        name = env.env_method("description", indices=0)[0]
+    else:  # not made of single environments, or out of reach
         name = layers[-1]
     return {
         "environment": name,
@@ -64,17 +65,6 @@ def describe_env(env: VecEnv) -> dict[str, str]:
         "action space": str(env.action_space),
         "vectorised wrappers": ", ".join(layers[:-1]) or "none",
     }
-
-
-def _single_name(env: gym.Env) -> str:
-    """Classes of an environment's wrappers, from outside to inside, and its id; its own words may tell its state."""
-    names, spec = [], env.spec
-    while isinstance(env, gym.Wrapper):
-        names.append(type(env).__name__)
-        env = env.env
-    # That one is put in when training starts
-    names = [*(name for name in names if name != "EpisodeReplay"), type(env).__name__]
-    return f"{spec.id if spec is not None else 'without id'} ({' '.join(names)})"
 
 
 def describe_callbacks(callbacks: Mapping[str, BaseCallback]) -> dict[str, str]:
