@@ -70,9 +70,11 @@ def keep_churn_state(
         past = past.as_dict()
     if past is not None:
         task_switch.task_id = past["task_id"]
-        for name in reducers.keys() & past["reducers"].keys():
+        # Earlier versions had one reducer, and saved it without a name
+        saved_reducers = past["reducers"] if "reducers" in past else {next(iter(reducers)): past["reducer"]}
+        for name in reducers.keys() & saved_reducers.keys():
             reducer = reducers[name]
-            saved, fresh = past["reducers"][name], reducer.state_dict()
+            saved, fresh = saved_reducers[name], reducer.state_dict()
             same_kind = _shapes(saved) == _shapes(fresh)
             reducer.load_state_dict(saved if same_kind else {**fresh, "_extra_state": saved["_extra_state"]})
             reducer.move_reference(model.device)

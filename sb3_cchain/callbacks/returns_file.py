@@ -5,18 +5,11 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TextIO
-from weakref import WeakValueDictionary
 
-try:
-    import fcntl
-except ImportError:  # Windows: a file that another process writes is not noticed
-    fcntl = None  # type: ignore[assignment]
+from sb3_cchain.locked_file import open_locked
 
 RETURNS_CSV = "returns.csv"
 COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
-
-# The files that this process writes. One that is still open belongs to training that was interrupted.
-_open_files: WeakValueDictionary[Path, TextIO] = WeakValueDictionary()
 
 
 class ReturnsFile:
@@ -32,12 +25,12 @@ class ReturnsFile:
     def __init__(self, path: Path, rows: Iterable[Mapping[str, float]], keep_old: bool):
         path.parent.mkdir(parents=True, exist_ok=True)
         has_rows = _check_header(path)
-        self._file = _open_locked(path)
+        self._file = _open(path)
         if keep_old and has_rows:
-            if fcntl is None:
+            if os.name != "posix":
                 self._file.close()  # Windows does not rename a file that is open
             os.rename(path, _free_name(path))
-            self._file = _open_locked(path)  # closes the old file, whose lock has kept other processes away until now
+            self._file = _open(path)  # closes the old file, whose lock has kept other processes away until now
         self._file.truncate(0)
         csv.DictWriter(self._file, COLUMNS).writeheader()
         self.append(rows)
@@ -117,23 +110,9 @@ def _check_header(path: Path) -> bool:
         return file.readline() != ""
 
 
-def _open_locked(path: Path) -> TextIO:
-    interrupted = _open_files.pop(path.resolve(), None)
-    if interrupted is not None:
-        interrupted.close()
-    file = open(path, "a", newline="")
-    if fcntl is not None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            raise ValueError(
-                f"Another process is writing {path}. Give each training a file of its own: ContinualMetrics(path=...)"
-            ) from None
-        except OSError:
-            pass  # the file system has no locks
-    _open_files[path.resolve()] = file
-    return file
+def _open(path: Path) -> TextIO:
+    message = f"Another process is writing {path}. Give each training a file of its own: ContinualMetrics(path=...)"
+    return open_locked(path, message)
 
 
 def _free_name(path: Path) -> Path:

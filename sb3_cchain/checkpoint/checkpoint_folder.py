@@ -17,15 +17,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
 from typing import Any, TextIO
-from weakref import WeakValueDictionary
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.files import sync_folder, write_safely
-
-try:
-    import fcntl
-except ImportError:  # Windows: a second training in the same folder is not noticed
-    fcntl = None  # type: ignore[assignment]
+from sb3_cchain.locked_file import open_locked
 
 # Of the files. A later version of the package reads it, or says that it does not
 FORMAT = 1
@@ -176,7 +171,8 @@ class CheckpointFolder:
     def __init__(self, path: Path, keep: int, newest: int | None = None):
         self.path, self.keep = path, keep
         path.mkdir(parents=True, exist_ok=True)
-        self._lock: TextIO = _locked(path)
+        message = f"Another process is writing checkpoints to {path}. Give each training a `path` of its own."
+        self._lock: TextIO = open_locked(path / ".lock", message)
         try:
             self._check_newest(newest)
         except ValueError:
@@ -292,26 +288,3 @@ def _read_info(path: Path) -> dict[str, Any]:
 
 def _hash(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-# The locks of this process. One that is still held belongs to training that was interrupted
-_locks: WeakValueDictionary[Path, TextIO] = WeakValueDictionary()
-
-
-def _locked(folder: Path) -> TextIO:
-    interrupted = _locks.pop(folder.resolve(), None)
-    if interrupted is not None:
-        interrupted.close()
-    file = open(folder / ".lock", "w")
-    if fcntl is not None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            raise ValueError(
-                f"Another process is writing checkpoints to {folder}. Give each training a `path` of its own."
-            ) from None
-        except OSError:
-            pass  # the file system has no locks
-    _locks[folder.resolve()] = file
-    return file
