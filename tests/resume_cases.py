@@ -524,9 +524,8 @@ def in_new_process(function: Callable[..., Any], *arguments: Any) -> Any:
     :param arguments: Its arguments
     :return: What it returned in a process in which nothing was done before
     """
-    # Its processes are copies of one that has imported modules and done nothing else
+    # Its processes are copies of one that has imported modules (tests/conftest.py) and done nothing else
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.resume_preload"])
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_send, args=(there, function, arguments))
     process.start()
