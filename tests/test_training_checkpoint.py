@@ -351,8 +351,8 @@ def change_info(folder, **changes):
 
 
 def test_another_format(path):
-    change_info(step(path, NEWEST), format=2)
-    with pytest.raises(ValueError, match=r"has the format 2 of sb3-cchain \S+; this version reads the format 1"):
+    change_info(step(path, NEWEST), format=1)
+    with pytest.raises(ValueError, match=r"has the format 1 of sb3-cchain \S+; this version reads the format 2"):
         find_checkpoint(step(path, NEWEST))
 
 
