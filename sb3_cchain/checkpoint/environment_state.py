@@ -163,9 +163,9 @@ def _vec_layers(env: VecEnv) -> dict[str, VecEnv]:
 
 
 def _known(layers: Mapping[str, VecEnv]) -> dict[str, object]:
-    *_, base = layers.values()
+    *_, (base_name, base) = layers.items()
     # Not the empty tuple, which is one object wherever it stands
-    return {name: value for name in ENVIRONMENTS if (value := vars(base).get(name))}
+    return {f"{base_name} {name}": value for name in ENVIRONMENTS if (value := vars(base).get(name))}
 
 
 def _has_own_state(env: VecEnv) -> bool:
