@@ -183,6 +183,30 @@ def test_what_a_callback_and_an_environment_share_stays_shared(tmp_path, kind):
     assert curriculum.levels == list(range(11))
 
 
+class Decay(BaseCallback):
+    """Changes an attribute that is named like an argument, and keeps the other one."""
+
+    def __init__(self, rate, log_path):
+        super().__init__()
+        self.rate, self.log_path = rate, log_path
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.rate /= 2
+        self.model.ent_coef = self.rate
+
+
+def test_arguments_that_a_callback_changes_go_on(tmp_path):
+    expected = make()
+    expected.learn(STEPS, Decay(1.0, "first"))
+    train(make(), tmp_path, Decay(1.0, "first"))
+    callback = Decay(1.0, "second")
+    assert_same(expected, go_on(tmp_path, callback))
+    assert callback.rate == 2.0**-10 and callback.log_path == "second"
+
+
 def test_training_with_it_is_training_without_it(tmp_path):
     for create in (make, make_dqn):
         models = []

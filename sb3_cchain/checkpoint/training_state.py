@@ -1,7 +1,9 @@
 """All that the rest of a training depends on, besides what Stable-Baselines3 saves with a model."""
 
+import pickle
 import random
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +24,7 @@ from sb3_cchain.checkpoint.environment_state import (
     restore_remotes,
     vec_env_parts,
 )
-from sb3_cchain.checkpoint.object_state import object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import DATA, object_states, restore_objects
 from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
 from sb3_cchain.checkpoint.simulator_state import emptied
 from sb3_cchain.checkpoint.training_description import constructor_arguments
@@ -53,11 +55,14 @@ class TrainingParts(NamedTuple):
     :param model: The model
     :param callbacks: All callbacks of ``learn()``, in the order in which they are nested
     :param envs: The environments by name: ``env`` and those that callbacks evaluate in
+    :param arguments: Of each callback, the attributes that are named like arguments of its constructor, pickled as they were
+        when training started; data only
     """
 
     model: BaseAlgorithm
     callbacks: dict[str, BaseCallback]
     envs: dict[str, VecEnv]
+    arguments: dict[str, dict[str, bytes]]
 
     @property
     def known(self) -> dict[str, object]:
@@ -97,7 +102,17 @@ def training_parts(model: BaseAlgorithm, callback: BaseCallback) -> TrainingPart
     envs = {"env": model.env}
     for name, found in callbacks.items():
         envs.update({f"{name} {key}": value for key, value in vars(found).items() if _is_other_env(value, model.env)})
-    return TrainingParts(model, callbacks, envs)
+    return TrainingParts(model, callbacks, envs, {name: _arguments(found) for name, found in callbacks.items()})
+
+
+def _arguments(callback: BaseCallback) -> dict[str, bytes]:
+    found = {}
+    for name in vars(callback).keys() & constructor_arguments(type(callback)):
+        value = vars(callback)[name]
+        if isinstance(value, DATA):  # not a model or an environment
+            with suppress(Exception):  # whatever the code of an object raises
+                found[name] = pickle.dumps(value, protocol=5)
+    return found
 
 
 def env_layers(env: VecEnv) -> Iterator[VecEnv]:
@@ -126,11 +141,13 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     model, callbacks, known = parts.model, parts.callbacks, parts.known
     left_out: list[str] = []
     envs = parts.env_parts() if with_envs else {}
-    # Callbacks keep the arguments with which the present process made them, such as the files that they write
-    skip: dict[str, Collection[str]] = {
-        "model": _SKIPPED_OF_MODEL | _views(model),
-        **{name: _SKIPPED_OF_CALLBACK | constructor_arguments(type(found)) for name, found in callbacks.items()},
-    }
+    skip: dict[str, Collection[str]] = {"model": _SKIPPED_OF_MODEL | _views(model)}
+    for name, callback in callbacks.items():
+        # Callbacks keep the arguments with which the present process made them, such as the files that they write, but for
+        # those that they change themselves
+        before, now = parts.arguments[name], _arguments(callback)
+        changed = {argument for argument in before.keys() & now.keys() if before[argument] != now[argument]}
+        skip[name] = _SKIPPED_OF_CALLBACK | (constructor_arguments(type(callback)) - changed)
     holders: dict[str, object] = {"model": model, **callbacks}
     strict: list[str] = []
     for env in envs.values():
