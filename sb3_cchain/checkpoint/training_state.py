@@ -4,7 +4,6 @@ import pickle
 import random
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,8 +43,6 @@ _SKIPPED_OF_CALLBACK = frozenset({"model", "parent", "locals", "globals", "_star
 _GSDE_NOISE = ("exploration_mat", "exploration_matrices")
 # What was recorded and not yet written
 _PENDING = ("name_to_value", "name_to_count", "name_to_excluded")
-# Of a model: the episodes under way
-_EPISODE = ("_last_obs", "_last_episode_starts", "_last_original_obs")
 
 
 class TrainingParts(NamedTuple):
@@ -208,7 +205,6 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
         holders.update(env.holders)
         known.update(env.known)
     _restore_parameters(model, model_path)
-    fresh = {name: deepcopy(vars(model)[name]) for name in _EPISODE if name in vars(model)}
     restore_objects(holders, state["objects"], known)
     for name in envs:
         restore_remotes(parts.envs[name], state["envs"][name][1])
@@ -216,8 +212,6 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
         vars(noise).update(saved)
     if state["replay_buffer"] is not None:
         restore_replay_buffer(model.replay_buffer, state["replay_buffer"], store, known)  # type: ignore[attr-defined]
-    if state["envs"] is None:
-        vars(model).update(fresh)
     for name, values in state["logged"].items():
         vars(model.logger)[name].clear()
         vars(model.logger)[name].update(values)
