@@ -1,6 +1,7 @@
 """The tables of the results."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean
 
 import numpy as np
 from scipy.stats import ttest_ind
@@ -77,7 +78,7 @@ def _compared(before: Sequence[float], after: Sequence[float]) -> tuple[str, str
     """Both means, and their difference with its 95 % interval, which is bold where it leaves out 0."""
     if not before or not after:
         return "", "not done"
-    means, difference = f"{number(np.mean(before))} → {number(np.mean(after))}", np.mean(after) - np.mean(before)
+    means, difference = f"{number(fmean(before))} → {number(fmean(after))}", fmean(after) - fmean(before)
     if min(len(before), len(after)) < 2 or np.ptp(before) == np.ptp(after) == 0:
         return means, number(difference)
     low, high = ttest_ind(after, before, equal_var=False).confidence_interval(0.95)
@@ -97,7 +98,7 @@ def case_table(case: Case, evaluations: Evaluations) -> str:
         row = [variant.label]
         for measure in MEASURES.values():
             scores = [measure(case, seeds[seed]) for seed in sorted(seeds)]
-            row += [", ".join(map(number, scores)), number(np.mean(scores)) if scores else ""]
+            row += [", ".join(map(number, scores)), number(fmean(scores)) if scores else ""]
         rows.append(row)
     header = ["", *(cell for name in MEASURES for cell in (f"{name}, by seed", "mean"))]
     return _with_missing(markdown_table(header, rows), case, evaluations)
@@ -142,16 +143,15 @@ def falls_table(case: Case, evaluations: Evaluations) -> str:
         for seed, each in sorted(evaluations[name].items()):
             fall = falls(each, case.solved, case.worst)
             words = ["never", "", ""] if fall is None else [f"{fall[0]:.0f}", number(fall[1]), f"{fall[2]:.0%}"]
-            rows.append([variant.label, str(seed), *words, number(each[-1, 1]), number(each[:, 1].mean())])
+            rows.append([variant.label, str(seed), *words, number(each[-1, 1]), number(over_training(case, each))])
     header = ["", "seed", "solved at step", "lowest after it", "below half after it", "last", "mean"]
     return _with_missing(markdown_table(header, rows), case, evaluations)
 
 
-def number(value: float | np.floating) -> str:
+def number(value: float) -> str:
     """
     :param value: A score
     :return: It with three digits or, from 1000 on, as a whole number
     """
-    size = float(abs(value))
-    decimals = 0 if size >= 100 else 1 if size >= 10 else 2
+    decimals = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
     return f"{value:.{decimals}f}"
