@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.family.cases import CASES
 from benchmarks.family.picture import plot
-from benchmarks.family.tables import case_table, falls_table, read_all, summary_table
+from benchmarks.family.tables import about, case_table, falls_table, read_all, summary_table
 from benchmarks.family.training import runs_of, train_all
 from benchmarks.grid.run import ROOT
 from benchmarks.speed.tables import write_tables
@@ -62,10 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.case:
         print(*(f"\n{name}\n\n{table}" for name, table in tables.items()), sep="\n")
     if args.write:
-        write_tables({**tables, "family_evidence": summary_table(results)}, args.docs)
         for name in args.case or CASES:
-            if any(results[name][1].values()):
-                plot(*results[name], args.docs / "images" / "family" / f"{name}.png")
+            case, evaluations = results[name]
+            parts = [about(case), tables[f"family_{name}"]]
+            if any(evaluations.values()):
+                picture = f"images/family/{name}.png"
+                plot(case, evaluations, args.docs / picture)
+                parts.append(f"![Learning curves: {case.title}](../{picture})")
+            tables[f"family_{name}"] = "\n\n".join(parts)
+        write_tables({**tables, "family_evidence": summary_table(results)}, args.docs)
 
 
 def _check(parser: argparse.ArgumentParser, option: str, asked: Sequence[Any] | None, known: Sequence[Any]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
+from textwrap import fill
 
 import numpy as np
 from scipy.stats import ttest_ind
@@ -9,9 +10,12 @@ from scipy.stats import ttest_ind
 from benchmarks.family.cases import Case
 from benchmarks.family.training import Run, read
 from benchmarks.report.markdown import markdown_table
+from benchmarks.speed.tables import LINE_LENGTH
 
 # Of the evaluations of each task, the last fifth is its end
 END = 0.2
+
+NOTHING = "No run is done yet."
 
 # Evaluations of the runs that are done: by variant, then by seed
 Evaluations = Mapping[str, Mapping[int, np.ndarray]]
@@ -55,29 +59,30 @@ MEASURES = {"over training": over_training, "at the end": at_the_end}
 def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
     """
     :param cases: Cases and their results, by name
-    :return: A table with a row for each C-CHAIN variant, against the first variant of its case
+    :return: A table with a row for each C-CHAIN variant, against the first variant of its case, and what is missing
     """
-    rows = []
+    rows, missing = [], []
     for case, evaluations in cases.values():
         base, *others = case.variants
         for name in others:
             if not name.startswith("cchain"):
                 continue
+            label, seeds = case.variants[name].label, [len(evaluations[base]), len(evaluations[name])]
+            if min(seeds) == 0:
+                missing.append(f"{case.title}: {label}")
+                continue
             cells: list[str] = []
             for measure in MEASURES.values():
-                before = [measure(case, each) for each in evaluations[base].values()]
-                after = [measure(case, each) for each in evaluations[name].values()]
+                before, after = ([measure(case, each) for each in evaluations[key].values()] for key in (base, name))
                 cells += _compared(before, after)
-            seeds = f"{len(evaluations[base])}, {len(evaluations[name])}"
-            rows.append([case.title, case.variants[name].label, seeds, *cells])
+            rows.append([case.title, label, ", ".join(map(str, dict.fromkeys(seeds))), *cells])
     header = ["", "", "seeds", *(cell for name in MEASURES for cell in (name, "difference"))]
-    return markdown_table(header, rows)
+    table = markdown_table(header, rows)
+    return f"{table}\n\n{fill('Not done yet: ' + '; '.join(missing) + '.', LINE_LENGTH)}" if missing else table
 
 
 def _compared(before: Sequence[float], after: Sequence[float]) -> tuple[str, str]:
     """Both means, and their difference with its 95 % interval, which is bold where it leaves out 0."""
-    if not before or not after:
-        return "", "not done"
     means, difference = f"{number(fmean(before))} → {number(fmean(after))}", fmean(after) - fmean(before)
     if min(len(before), len(after)) < 2 or np.ptp(before) == np.ptp(after) == 0:
         return means, number(difference)
@@ -92,6 +97,8 @@ def case_table(case: Case, evaluations: Evaluations) -> str:
     :param evaluations: Its results
     :return: A table with the scores of each seed, and which runs are missing
     """
+    if not any(evaluations.values()):
+        return NOTHING
     rows = []
     for name, variant in case.variants.items():
         seeds = evaluations[name]
@@ -113,7 +120,24 @@ def _with_missing(table: str, case: Case, evaluations: Evaluations) -> str:
     if not missing:
         return table
     words = "; ".join(f"{case.variants[name].label}: {', '.join(seeds)}" for name, seeds in missing.items())
-    return f"{table}\n\nSeeds that are not done yet: {words}."
+    return f"{table}\n\n{fill(f'Seeds that are not done yet: {words}.', LINE_LENGTH)}"
+
+
+def about(case: Case) -> str:
+    """
+    :param case: A case
+    :return: How its runs are made
+    """
+    tasks = f"{case.n_tasks} tasks of " if case.n_tasks > 1 else ""
+    steps, every = (
+        f"{steps:,}".replace(",", " ") if steps >= 10_000 else str(steps)
+        for steps in (case.steps // case.n_tasks, case.eval_freq)
+    )
+    words = (
+        f"{tasks}{steps} steps; {case.source}. Evaluated every {every} steps, by {case.n_eval_episodes} episodes without "
+        "exploration."
+    )
+    return fill(words, LINE_LENGTH)
 
 
 def falls(evaluations: np.ndarray, solved: float, worst: float) -> tuple[float, float, float] | None:
@@ -138,6 +162,8 @@ def falls_table(case: Case, evaluations: Evaluations) -> str:
     :return: A table with a row per run, and which runs are missing
     """
     assert case.solved is not None
+    if not any(evaluations.values()):
+        return NOTHING
     rows = []
     for name, variant in case.variants.items():
         for seed, each in sorted(evaluations[name].items()):
