@@ -39,6 +39,7 @@ def plot(case: Case, evaluations: Evaluations, path: Path) -> None:
             panel.axvline(task * case.steps / case.n_tasks, color="black", linewidth=0.6, linestyle=":")
         if case.solved is not None:
             panel.axhline(case.solved, color="black", linewidth=0.6, linestyle=":")
+            panel.set_ylim(bottom=case.worst)
         panel.set(title=case.variants[name].label, xlabel="environment steps")
         panel.title.set_fontsize(10)
         panel.spines[["top", "right"]].set_visible(False)
