@@ -82,7 +82,7 @@ def test_a_difference_is_bold_when_its_interval_leaves_out_0(runs):
 
 def test_tables_without_runs(runs):
     evaluations = read_all(runs)
-    assert summary_table({"small": (SMALL, evaluations)}).endswith("Not done yet: Continual CartPole: C-CHAIN.")
+    assert summary_table({"small": (SMALL, evaluations)}).endswith("Not done yet: Continual CartPole (C-CHAIN).")
     assert case_table(SMALL, evaluations) == falls_table(replace(SMALL, solved=475), evaluations) == "No run is done yet."
 
 
@@ -160,7 +160,7 @@ def test_the_command(runs, tmp_path, capsys):
     page.write_text("".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in ("family_small", "family_evidence")))
     command.main(["--write", *arguments])
     assert "small" in (shown := capsys.readouterr().out) and " 2 of  4 runs" in shown
-    assert "| PPO | " in page.read_text() and "Not done yet: Continual CartPole: C-CHAIN." in page.read_text()
+    assert "| PPO | " in page.read_text() and "Not done yet: Continual CartPole (C-CHAIN)." in page.read_text()
     assert (tmp_path / "docs/images/family/small.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -92,12 +92,12 @@ _DQN = {
 _SAC = {
     "sac": Variant("SAC", SAC),
     "cchain": Variant("C-CHAIN SAC", CChainSAC),
-    "cchain_value": Variant("C-CHAIN SAC, values", CChainSAC, {"churn_target": "value"}),
+    "cchain_value": Variant("C-CHAIN SAC (values)", CChainSAC, {"churn_target": "value"}),
 }
 _TD3 = {
     "td3": Variant("TD3", TD3),
     "cchain": Variant("C-CHAIN TD3", CChainTD3),
-    "cchain_value": Variant("C-CHAIN TD3, values", CChainTD3, {"churn_target": "value"}),
+    "cchain_value": Variant("C-CHAIN TD3 (values)", CChainTD3, {"churn_target": "value"}),
 }
 _CARTPOLE_DQN: dict[str, Any] = {
     **{"learning_rate": 2.3e-3, "batch_size": 64, "buffer_size": 100_000, "learning_starts": 1000, "gamma": 0.99},

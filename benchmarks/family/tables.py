@@ -61,7 +61,8 @@ def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
     :param cases: Cases and their results, by name
     :return: A table with a row for each C-CHAIN variant, against the first variant of its case, and what is missing
     """
-    rows, missing = [], []
+    rows = []
+    missing: dict[str, list[str]] = {}
     for case, evaluations in cases.values():
         base, *others = case.variants
         for name in others:
@@ -69,7 +70,7 @@ def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
                 continue
             label, seeds = case.variants[name].label, [len(evaluations[base]), len(evaluations[name])]
             if min(seeds) == 0:
-                missing.append(f"{case.title}: {label}")
+                missing.setdefault(case.title, []).append(label)
                 continue
             cells: list[str] = []
             for measure in MEASURES.values():
@@ -78,7 +79,10 @@ def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
             rows.append([case.title, label, ", ".join(map(str, dict.fromkeys(seeds))), *cells])
     header = ["", "", "seeds", *(cell for name in MEASURES for cell in (name, "difference"))]
     table = markdown_table(header, rows)
-    return f"{table}\n\n{fill('Not done yet: ' + '; '.join(missing) + '.', LINE_LENGTH)}" if missing else table
+    if not missing:
+        return table
+    words = "; ".join(f"{title} ({', '.join(labels)})" for title, labels in missing.items())
+    return f"{table}\n\n{fill(f'Not done yet: {words}.', LINE_LENGTH)}"
 
 
 def _compared(before: Sequence[float], after: Sequence[float]) -> tuple[str, str]:
