@@ -5,15 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
-from sb3_cchain.callbacks import TaskLearningStarts, read_returns
+from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
-from sb3_cchain.methods import Oracle, ShrinkAndPerturb
+from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart, Oracle, ShrinkAndPerturb
 from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
 from sb3_cchain.tasks import TaskBoundary
 from sb3_cchain.tasks.task_signal import _equal
@@ -25,6 +26,8 @@ SWITCH = 32
 
 class World(CountEnv):
     """Episodes of two steps. After ``change_at`` steps it has another level and other rewards, and says so in its info."""
+
+    difficulty = 1
 
     def __init__(self, change_at=SWITCH):
         super().__init__(length=2)
@@ -80,12 +83,6 @@ DELAY = {"drift": 26}
 N_STEPS = 2 * SWITCH - 4
 
 
-def make_world():
-    world = World()
-    world.difficulty = 1
-    return world
-
-
 def signals(source):
     before, arguments = SOURCES[source]
     return [*(make() for make in before), TaskSignal(**arguments)]
@@ -96,7 +93,8 @@ def train(model, source, callbacks):
     n_steps = N_STEPS + DELAY.get(source, 0)
     if source != "set_env":
         return model.learn(n_steps, callback=[*signals(source), *callbacks], log_interval=None)
-    for world, steps in ((model.env, SWITCH), (make_world(), n_steps - SWITCH)):
+    other = model.env.envs[0].unwrapped.__class__()
+    for world, steps in ((model.env, SWITCH), (other, n_steps - SWITCH)):
         model.set_env(world)
         model.learn(steps, [*signals(source), *callbacks], log_interval=None, reset_num_timesteps=False)
     return model
@@ -109,7 +107,7 @@ by_source = pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("algorithm", ["PPO", "DQN", "CChainPPO"])
 def test_returns_are_those_of_the_tasks(tmp_path, algorithm, source):
     path = tmp_path / "returns.csv"
-    model = make_model(algorithm, make_world())
+    model = make_model(algorithm, World())
     train(model, source, [ContinualMetrics(path)])
     rows = read_returns(path)
     assert list(dict.fromkeys(row["task_id"] for row in rows)) == [0, 1]
@@ -134,13 +132,21 @@ def count_calls(owner, name):
 def boundary(make):
     def listener(algorithm):
         callback = make()
-        return make_model(algorithm, make_world()), [callback], count_calls(callback, "_on_task_switch")
+        return make_model(algorithm, World()), [callback], count_calls(callback, "_on_task_switch")
 
     return listener
 
 
+def gaussian(algorithm):
+    class Continuous(World):
+        action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    callback = LogStdRestart()
+    return make_model("PPO", Continuous()), [callback], count_calls(callback, "_on_task_switch")
+
+
 def coefficient_of_the_model(algorithm):
-    model = make_model(f"CChain{algorithm}", make_world(), reset_churn_coef=True)
+    model = make_model(f"CChain{algorithm}", World(), reset_churn_coef=True)
     return model, [], count_calls(model.churn_reducer.coefficient, "reset")
 
 
@@ -154,17 +160,17 @@ def coefficient_of_the_callback(algorithm):
         callback.churn_reducer.coefficient.reset = lambda: (calls.append(True), method())
 
     callback._on_training_start = on_training_start
-    return make_model(algorithm, make_world()), [callback], calls
+    return make_model(algorithm, World()), [callback], calls
 
 
 def normalization(algorithm):
-    env = TaskVecNormalize(make_vec_env(make_world))
+    env = TaskVecNormalize(make_vec_env(World))
     return make_model(algorithm, env), [], count_calls(env, "_restart")
 
 
 def learning_starts(algorithm):
     callback = TaskLearningStarts(4)
-    model = make_model("DQN", make_world())
+    model = make_model("DQN", World())
 
     class Calls:
         def __len__(self):
@@ -176,13 +182,17 @@ def learning_starts(algorithm):
 LISTENERS = {
     "Oracle": boundary(Oracle),
     "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
+    "ExplorationRateRestart": boundary(ExplorationRateRestart),
+    "EntropyBonusRestart": boundary(EntropyBonusRestart),
+    "LogStdRestart": gaussian,
+    "TaskSchedule": boundary(lambda: TaskSchedule(SWITCH)),
     "TaskLearningStarts": learning_starts,
     "CChain": coefficient_of_the_model,
     "CChainCallback": coefficient_of_the_callback,
     "TaskVecNormalize": normalization,
 }
 # Oracle with both algorithms, the others in turn
-WITH_DQN = {"Oracle", "ShrinkAndPerturb", "TaskLearningStarts", "CChainCallback"}
+WITH_DQN = {"Oracle", "ShrinkAndPerturb", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
 WITH_PPO = LISTENERS.keys() - WITH_DQN | {"Oracle"}
 
 
@@ -198,9 +208,9 @@ def test_every_listener_hears_every_source(algorithm, name, source):
     assert len(calls) == 1
 
 
-def test_every_boundary_of_the_registry_is_a_listener_here():
-    classes = {cls for method in REGISTRY for cls in method.callbacks if issubclass(cls, TaskBoundary)}
-    assert {cls.__name__ for cls in classes} <= LISTENERS.keys()
+def test_every_boundary_is_a_listener_here():
+    classes = {cls.__name__ for cls in TaskBoundary.__subclasses__() if cls.__module__.startswith("sb3_cchain.")}
+    assert classes <= LISTENERS.keys() and {"Oracle", "TaskSchedule"} <= classes
 
 
 @pytest.mark.parametrize("method", [m for m in REGISTRY if m.page != FAMILY_PAGE], ids=lambda method: method.algo)
@@ -208,7 +218,7 @@ def test_every_method_trains_with_a_signal(method):
     policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
-    model = make_model(method.algorithm.__name__, make_world(), policy=method.policy, policy_kwargs=policy_kwargs)
+    model = make_model(method.algorithm.__name__, World(), policy=method.policy, policy_kwargs=policy_kwargs)
     callbacks = [make_callback(cls) for cls in method.callbacks]
     model.learn(SWITCH + 16, [TaskSignal(switch_at=[SWITCH]), *callbacks, ContinualMetrics()])
     assert model.continual_state["n_switches"] == 1
@@ -257,7 +267,7 @@ def test_the_user_does_not_contradict_the_environment():
 
 def test_two_reports_at_a_step_are_one_switch():
     """The call, another environment, and an attribute that differs there."""
-    worlds, metrics = [make_world(), make_world()], ContinualMetrics()
+    worlds, metrics = [World(), World()], ContinualMetrics()
     worlds[1].difficulty = 2
     model = make_model("PPO", worlds[0])
     signal = TaskSignal(attribute="difficulty")
@@ -283,7 +293,7 @@ def test_a_world_that_comes_back_is_a_new_task():
 @pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))])
 def test_environments_side_by_side(kwargs):
     oracle = Oracle()
-    env = make_vec_env(make_world, 2, **kwargs)
+    env = make_vec_env(World, 2, **kwargs)
     make_model("PPO", env, n_steps=8).learn(96, [TaskSignal(attribute="level"), oracle])
     env.close()
     assert oracle.n_resets == 1
@@ -311,9 +321,9 @@ def test_an_interrupted_signal_is_silent_in_the_next_training():
 
 @pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
 def test_a_saved_model_goes_on_counting(tmp_path, algorithm):
-    model = make_model(algorithm, make_world())
+    model = make_model(algorithm, World())
     model.learn(SWITCH + 8, [TaskSignal(attribute="level"), ContinualMetrics()]).save(tmp_path / "model")
-    world = make_world()
+    world = World()
     loaded = type(model).load(tmp_path / "model", env=world, device="cpu")
     # Its level is the first one again, which is another one than the last
     loaded.learn(16, [TaskSignal(attribute="level"), ContinualMetrics()], reset_num_timesteps=False)
@@ -328,9 +338,9 @@ def test_resumed_exactly(tmp_path, algorithm, arguments):
     def callbacks(folder):
         return [TaskSignal(**arguments), ContinualMetrics(), Oracle(), TrainingCheckpoint(16, folder, keep=10)]
 
-    make_model(algorithm, make_world()).learn(64, whole := callbacks(tmp_path / "whole"))
+    make_model(algorithm, World()).learn(64, whole := callbacks(tmp_path / "whole"))
     (checkpoint,) = (tmp_path / "whole").glob("step_*16")
-    resume(checkpoint, make_world(), resumed := callbacks(tmp_path / "resumed"))
+    resume(checkpoint, World(), resumed := callbacks(tmp_path / "resumed"))
     assert resumed[1].rows == whole[1].rows
     assert {row["task_id"] for row in whole[1].rows} > {0}
 
@@ -401,12 +411,12 @@ def test_bad_arguments(arguments, error, message):
 )
 def test_a_source_that_is_not_there(arguments, error, message):
     with pytest.raises(error, match=message):
-        make_model("PPO", make_world()).learn(16, TaskSignal(**arguments))
+        make_model("PPO", World()).learn(16, TaskSignal(**arguments))
 
 
 def test_returns_need_a_monitor():
-    model = make_model("PPO", make_vec_env(make_world))
-    model.set_env(model.env.__class__([make_world]))  # nobody records episodes
+    model = make_model("PPO", make_vec_env(World))
+    model.set_env(model.env.__class__([World]))  # nobody records episodes
     with pytest.raises(ValueError, match=r"wrap it in stable_baselines3.common.monitor.Monitor"):
         model.learn(16, TaskSignal(drift="adwin"))
 
