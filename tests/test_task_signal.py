@@ -1,6 +1,7 @@
 """Where the signal of a task switch comes from, and that everything hears of it."""
 
 import builtins
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
+from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart, Oracle, ShrinkAndPerturb
@@ -406,7 +408,7 @@ def test_bad_arguments(arguments, error, message):
     "arguments, error, message",
     [
         (dict(key="lvl"), ValueError, r"the environment's info must have 'lvl', but it has .*'level'"),
-        (dict(attribute="lvl"), AttributeError, "lvl"),
+        (dict(attribute="lvl"), ValueError, "`attribute` must be one of the environment or of a wrapper, but none has 'lvl'"),
     ],
 )
 def test_a_source_that_is_not_there(arguments, error, message):
@@ -425,6 +427,33 @@ def test_returns_need_a_monitor():
 def test_the_signal_comes_first(make, algorithm):
     with pytest.raises(ValueError, match=f"TaskSignal must come before {make.__name__}"):
         make_model(algorithm, CountEnv()).learn(16, [make(), TaskSignal()])
+
+
+def test_another_environment_in_a_training_that_begins_anew_is_warned_of():
+    model = make_model("PPO", CountEnv()).learn(16, TaskSignal())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(16, TaskSignal())
+    model.set_env(CountEnv())
+    with pytest.warns(UserWarning, match=r"`set_env\(\)` gave another environment, but .* reset_num_timesteps=False"):
+        model.learn(16, TaskSignal())
+
+
+def test_a_model_that_has_heard_a_signal_is_inspected():
+    model = make_model("PPO", World()).learn(16, [TaskSignal(attribute="level"), oracle := Oracle()])
+    inspection = inspect_model(model, callbacks=[TaskSignal(attribute="level"), oracle])
+    assert inspection.figures["rollout/n_steps"] == 16 and oracle.n_resets == 0
+    model.env.set_attr("level", "hard")
+    inspect_model(model, callbacks=[TaskSignal(attribute="level"), oracle])
+    assert oracle.n_resets == 1
+
+
+def test_from_yaml():
+    """As the stock RL Zoo reads ``callback:``."""
+    entries = [{"sb3_cchain.TaskSignal": {"switch_at": [16]}}, "sb3_cchain.ContinualMetrics", "sb3_cchain.methods.Oracle"]
+    callbacks = pytest.importorskip("rl_zoo3.utils").get_callback_list({"callback": entries})
+    make_model("PPO", CountEnv()).learn(32, callbacks)
+    assert callbacks[2].n_resets == 1
 
 
 def test_one_signal_is_enough():

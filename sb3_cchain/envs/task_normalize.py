@@ -9,7 +9,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
-from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info, speaking_signal
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.validation import check_bool
 
 Observation = NDArray | dict[str, NDArray]
@@ -127,7 +127,7 @@ class TaskVecNormalize(VecNormalize):
             return False
         # The vectorised environment has begun the next episode by itself; the info of the step is still that of the old one
         switched = self._switch.happened(first_reset_info(self.venv).get(TASK_KEY))
-        signal = speaking_signal(self.venv)
+        signal = active_signal(self.venv)
         return switched if signal is None else self._signal_switch.happened(signal.next_task)
 
     def _restart(self) -> None:

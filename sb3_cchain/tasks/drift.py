@@ -14,6 +14,7 @@ class Drift:
     Watches a series of values, one at a time.
 
     The detector is ADWIN of ``river``, asked after each value. It needs at least ten values, five of them since the change.
+    After an alarm it starts over.
 
     :param detector: ``"adwin"``
     :param delta: δ of ADWIN, between 0 and 1
@@ -44,7 +45,10 @@ class Drift:
         if not self._adwin.drift_detected:
             return False
         after = self._adwin.estimation
-        return after < before if self.worse == "smaller" else after > before
+        has_become_worse = after < before if self.worse == "smaller" else after > before
+        if has_become_worse:
+            self.reset()  # what a method does at the switch, such as a fresh network, is no drift
+        return has_become_worse
 
     def state_dict(self) -> dict[str, Any]:
         """

@@ -3,7 +3,7 @@
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_single
-from sb3_cchain.tasks.signal import episode_task, require_continual, speaking_signal
+from sb3_cchain.tasks.signal import active_signal, episode_task, require_continual
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tasks.task_signal import TaskSignal
 
@@ -22,7 +22,7 @@ def start_listening(callback: BaseCallback, needs_switches: bool = True) -> None
         _require_tasks(callback)
     require_single(callback)
     warn_without_sync(callback)
-    if has_signal and speaking_signal(callback.training_env) is None:
+    if has_signal and active_signal(callback.training_env) is None:
         name = type(callback).__name__
         raise ValueError(f"TaskSignal must come before {name}, which hears of switches from it: give it to `learn()` first")
     episode_task(callback.model)  # counts from now on

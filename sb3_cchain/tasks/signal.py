@@ -49,7 +49,7 @@ def step_task(model: BaseAlgorithm, infos: list[dict[str, Any]]) -> Any:
     :return: The task that the step was made in. It tells of a switch one step after the switch.
     """
     assert model.env is not None
-    signal = speaking_signal(model.env)
+    signal = active_signal(model.env)
     return _known_task(model, infos[0]) if signal is None else signal.step_task
 
 
@@ -60,7 +60,7 @@ def episode_task(model: BaseAlgorithm) -> Any:
         tasks, the step that ends a task ends an episode, and the vectorised environment has already begun the next one.
     """
     assert model.env is not None
-    signal = speaking_signal(model.env)
+    signal = active_signal(model.env)
     return _known_task(model, first_reset_info(model.env)) if signal is None else signal.next_task
 
 
@@ -80,21 +80,21 @@ def first_reset_info(env: VecEnv) -> dict[str, Any]:
 _signals: WeakKeyDictionary[VecEnv, ref[Any]] = WeakKeyDictionary()
 
 
-def let_speak(signal: Any) -> None:
+def register_signal(signal: Any) -> None:
     """
     :param signal: A :class:`~sb3_cchain.TaskSignal`, when training starts. Its ``learn()`` hears of switches from it alone.
     """
     _signals[signal.training_env.unwrapped] = ref(signal)
 
 
-def speaking_signal(env: VecEnv) -> Any:
+def active_signal(env: VecEnv) -> Any:
     """
     :param env: A vectorised environment
     :return: The :class:`~sb3_cchain.TaskSignal` of the ``learn()`` that trains in it; None where there is none
     """
     found = _signals.get(env.unwrapped)
     signal = None if found is None else found()
-    return signal if signal is not None and signal.speaks else None
+    return signal if signal is not None and signal.is_active else None
 
 
 # The environment that each model was last trained in. It is not saved with the model: where training is resumed, the same
@@ -108,16 +108,27 @@ def task_count(model: BaseAlgorithm) -> int:
     :return: How often it has changed to another environment, plus the calls of :func:`task_switched`. An environment that
         comes again is a new task, too. The number is kept as ``model.task_count``.
     """
+    if model.num_timesteps == 0:
+        model.task_count = 0  # type: ignore[attr-defined]
+    elif has_other_env(model):
+        _count_one_more(model)
+    _last_envs[model] = ref(_single_env(model))
+    return getattr(model, "task_count", 0)
+
+
+def has_other_env(model: BaseAlgorithm) -> bool:
+    """
+    :param model: A model during ``learn()``
+    :return: Whether its environment is another one than at the last :func:`task_count`
+    """
+    return model in _last_envs and _last_envs[model]() is not _single_env(model)
+
+
+def _single_env(model: BaseAlgorithm) -> Any:
     assert model.env is not None
     env = model.env.unwrapped
     # set_env() wraps the same environment again
-    env = env.envs[0].unwrapped if hasattr(env, "envs") else env
-    if model.num_timesteps == 0:
-        model.task_count = 0  # type: ignore[attr-defined]
-    elif model in _last_envs and _last_envs[model]() is not env:
-        _count_one_more(model)
-    _last_envs[model] = ref(env)
-    return getattr(model, "task_count", 0)
+    return env.envs[0].unwrapped if hasattr(env, "envs") else env
 
 
 def task_switched(model: BaseAlgorithm) -> None:
@@ -129,7 +140,7 @@ def task_switched(model: BaseAlgorithm) -> None:
     :raises ValueError: When the environment numbers its tasks itself, in ``info["task_id"]``, and no
         :class:`~sb3_cchain.TaskSignal` is given to ``learn()``
     """
-    if model.env is not None and speaking_signal(model.env) is None and TASK_KEY in first_reset_info(model.env):
+    if model.env is not None and active_signal(model.env) is None and TASK_KEY in first_reset_info(model.env):
         raise ValueError(
             f"`task_switched()` is not heard where the environment numbers its tasks itself, in info[{TASK_KEY!r}]. Leave it "
             "out, or have both count by giving `learn()` a TaskSignal."

@@ -1,5 +1,6 @@
 """The callback that says where the signal of task switches comes from."""
 
+import warnings
 from bisect import bisect_right
 from collections.abc import Sequence
 from copy import deepcopy
@@ -10,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.drift import Drift
-from sb3_cchain.tasks.signal import TASK_KEY, first_reset_info, let_speak, task_count
+from sb3_cchain.tasks.signal import TASK_KEY, first_reset_info, has_other_env, register_signal, task_count
 from sb3_cchain.validation import check_list, check_number
 
 
@@ -36,8 +37,8 @@ class TaskSignal(BaseCallback):
     - ``drift``: nobody says so, and a detector finds out. ``"adwin"`` is ADWIN of the package ``river``
       (https://doi.org/10.1137/1.9781611972771.42, Bifet & Gavaldà, 2007), which compares the older with the newer values of
       a window, of any length, and cuts it where their means differ. It is a switch when the newer values are worse: smaller
-      returns, or otherwise greater values. What gets better is taken for learning. After a switch that was reported
-      otherwise, the detector starts over.
+      returns, or otherwise greater values. What gets better is taken for learning. After each switch the detector starts
+      over.
 
     The state is kept with the model, as ``model.task_signal``: a saved model that is trained further goes on counting, and
     hears of a change in the meantime. The detector starts over then, except where training is resumed exactly, from a
@@ -91,7 +92,7 @@ class TaskSignal(BaseCallback):
         self._step_task = 0
 
     @property
-    def speaks(self) -> bool:
+    def is_active(self) -> bool:
         """Whether the ``learn()`` that it was given to goes on, or was the model's last one."""
         return self.model.start_time == self._start_time
 
@@ -107,10 +108,17 @@ class TaskSignal(BaseCallback):
 
     def _on_training_start(self) -> None:
         require_single(self)
+        if self.attribute is not None and not self.training_env.has_attr(self.attribute):
+            raise ValueError(f"`attribute` must be one of the environment or of a wrapper, but none has {self.attribute!r}")
+        if self.num_timesteps == 0 and has_other_env(self.model):
+            warnings.warn(
+                "`set_env()` gave another environment, but this `learn()` begins anew, at step 0 of task 0. To go on in it as "
+                "the next task, call `learn(..., reset_num_timesteps=False)`."
+            )
         if self.num_timesteps == 0 or not hasattr(self.model, "task_signal"):
             self.model.task_signal = {"task": 0, "reports": {}}  # type: ignore[attr-defined]
         self._start_time = self.model.start_time
-        let_speak(self)
+        register_signal(self)
         self._hear({**self._in_info(first_reset_info(self.training_env)), **self._between_steps()})
         self._step_task = self.next_task
 
