@@ -302,6 +302,22 @@ CASES = {
         total=160,
         package="dm_control",
     ),
+    "PPO slippery ant drifting": Case(
+        *(PPO, vec_env("Continual/SlipperyAnt-v0", 1, n_tasks=3, steps_per_task=70, blend_steps=40, max_episode_steps=25)),
+        ON_POLICY,
+        continual=True,
+        total=160,
+        package="mujoco",
+    ),
+    "DQN minigrid processes": Case(
+        *(DQN, vec_env("Continual/MiniGrid-v0", 2, subproc=True, steps_per_task=100)),
+        dict(OFF_POLICY, train_freq=2),
+        continual=True,
+        package="minigrid",
+    ),
+    "PPO sequence": Case(
+        *(PPO, vec_env("Continual/Sequence-v0", steps_per_task=100, cycles=2), ON_POLICY), continual=True, total=400
+    ),
     # The algorithms of Stable-Baselines3 and sb3-contrib
     # After a signal, which does not wait for the end of an interval, the log goes on in another rhythm
     "A2C log interval": Case(

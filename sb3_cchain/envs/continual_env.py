@@ -246,7 +246,7 @@ def _check_spaces(tasks: list[gym.Env]) -> None:
             if space != first:
                 raise ValueError(
                     f"All tasks must have the same {kind}, but task 0 ({_name(tasks[0])}) has {first} and task {position} "
-                    f"({_name(task)}) has {space}. Wrap the tasks so that they agree, for instance by padding."
+                    f"({_name(task)}) has {space}. Wrap the tasks so that they agree, for instance by CommonSpaces."
                 )
 
 
