@@ -20,7 +20,7 @@ from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, resume
 from sb3_cchain.envs import ContinualEnv, register_envs
-from sb3_cchain.networks import make_lean
+from sb3_cchain.networks import make_lean, transfer
 from sb3_cchain.tasks import TaskSignal, TaskSync, task_switched
 from sb3_cchain.tensorboard import TensorBoardOverview
 
@@ -46,6 +46,7 @@ __all__ = [
     "make_lean",
     "resume",
     "task_switched",
+    "transfer",
 ]
 
 # Of sb3-contrib, which need not be installed: imported when they are asked for

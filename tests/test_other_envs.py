@@ -51,8 +51,9 @@ def play(env, n_steps, seed):
 @ALL
 @pytest.mark.filterwarnings("ignore")
 def test_passes_the_checkers(name):
-    check_env(make(name, steps_per_task=40).unwrapped, skip_render_check=True)
-    sb3_check_env(make(name, steps_per_task=40))
+    kwargs = dict(tasks=["Pong"]) if name == "Atari-v0" else {}  # whose seeded resets take long
+    check_env(make(name, steps_per_task=40, **kwargs).unwrapped, skip_render_check=True)
+    sb3_check_env(make(name, steps_per_task=40, **kwargs))
 
 
 @ALL

@@ -1,7 +1,6 @@
 """Continual environments: sequences of tasks as Gymnasium environments, and their normalisation."""
 
 from sb3_cchain.envs.atari import AtariTask, ContinualAtari
-from sb3_cchain.envs.common_spaces import CommonSpaces, ContinualSequence
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.dm_control import ContinualDMControl, FlatDMControl
 from sb3_cchain.envs.gym_control import ContinualGymControl, ObservationOffset
@@ -12,6 +11,7 @@ from sb3_cchain.envs.procgen_vec_env import ContinualProcgenVecEnv
 from sb3_cchain.envs.registration import register_envs
 from sb3_cchain.envs.reward_scale import RewardScale
 from sb3_cchain.envs.slippery_ant import ContinualSlipperyAnt
+from sb3_cchain.envs.space_padding import CommonSpaces, ContinualSequence
 from sb3_cchain.envs.task_normalize import TaskVecNormalize
 
 __all__ = [

@@ -31,7 +31,7 @@ OTHER_ENVS: dict[str, dict] = {
     "SlipperyAnt-v0": {"entry_point": "sb3_cchain.envs.slippery_ant:ContinualSlipperyAnt"},
     "MiniGrid-v0": {"entry_point": "sb3_cchain.envs.minigrid:ContinualMiniGrid"},
     "Atari-v0": {"entry_point": "sb3_cchain.envs.atari:ContinualAtari"},
-    "Sequence-v0": {"entry_point": "sb3_cchain.envs.common_spaces:ContinualSequence"},
+    "Sequence-v0": {"entry_point": "sb3_cchain.envs.space_padding:ContinualSequence"},
 }
 
 
