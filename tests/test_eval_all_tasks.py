@@ -11,9 +11,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
 from sb3_cchain.analysis import EvalAllTasks
-from sb3_cchain.analysis.eval_all_tasks import TASK_COLUMNS
+from sb3_cchain.analysis.eval_all_tasks import read_task_returns
 from sb3_cchain.analysis.metrics.continual import return_matrix
-from sb3_cchain.callbacks import read_returns
 from sb3_cchain.methods import Oracle
 from sb3_cchain.tensorboard.layout import layout_of
 from tests.envs import CountEnv, RandomEnv
@@ -34,7 +33,7 @@ def evaluate(path, total=96, env=None, **kwargs):
     model = CChainPPO("MlpPolicy", tasks() if env is None else env, **ARGUMENTS)
     callback = EvalAllTasks(kwargs.pop("eval_env", tasks()), path=path, n_eval_episodes=2, **kwargs)
     model.learn(total, callback=callback)
-    return model, read_returns(path, TASK_COLUMNS)
+    return model, read_task_returns(path)
 
 
 def test_evaluates_before_training_at_switches_and_at_the_end(tmp_path):
@@ -152,7 +151,7 @@ def test_resumed_training_goes_on_with_the_rows(tmp_path):
     loaded = CChainPPO.load(tmp_path / "model", env=tasks(), device="cpu")
     callback = EvalAllTasks(tasks(), path=tmp_path / "all.csv", n_eval_episodes=2)
     loaded.learn(32, callback=callback, reset_num_timesteps=False)
-    resumed = read_returns(tmp_path / "all.csv", TASK_COLUMNS)
+    resumed = read_task_returns(tmp_path / "all.csv")
     assert resumed[: len(rows)] == rows
     assert [(row["timesteps"], row["trained_task"]) for row in resumed[::3]] == [(0, 0), (32, 0), (64, 1), (96, 2)]
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_cchain.analysis.metrics.continual import return_matrix
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.callbacks.log_folder import log_folder
-from sb3_cchain.callbacks.returns_file import ReturnsFile
+from sb3_cchain.callbacks.returns_file import ReturnsFile, read_returns
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.evaluation import check_same_tasks
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, is_continual, require_continual, step_task
@@ -185,6 +185,15 @@ class EvalAllTasks(BaseCallback):
 
         evaluate_policy(self.model, self.eval_env, self.n_eval_episodes, self.deterministic, callback=collect, warn=False)
         return float(np.mean(returns))
+
+
+def read_task_returns(path: str | Path) -> list[dict[str, float]]:
+    """
+    :param path: CSV file written by :class:`EvalAllTasks`
+    :return: Its rows
+    :raises ValueError: When it is not such a file, or a line of it is damaged
+    """
+    return read_returns(path, TASK_COLUMNS)
 
 
 def _figures(rows: list[dict[str, float]], trained_task: int) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Callbacks for training: the paper's rollouts, schedules, how well the agent does, and what callbacks share."""
 
-from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
+from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, task_averages
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
 from sb3_cchain.callbacks.returns_file import read_returns
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
@@ -15,4 +15,5 @@ __all__ = [
     "TaskLearningStarts",
     "TaskSchedule",
     "read_returns",
+    "task_averages",
 ]

@@ -30,8 +30,8 @@ class AtariTask(NamedTuple):
 class ContinualAtari(ContinualEnv[NDArray[np.uint8], np.int64]):
     """
     A chain of Atari games, or of modes and difficulties of a game (Farebrother et al., 2018, https://arxiv.org/abs/1810.00123).
-    The default sequence is that of CORA (Powers et al., CoLLAs 2022, https://arxiv.org/abs/2110.10067), which goes through
-    these games five times (``cycles=5``), 50 million frames each time.
+    The default sequence is that of CORA (Powers et al., CoLLAs 2022, https://arxiv.org/abs/2110.10067), whose
+    authors go through these games five times (``cycles=5``), 50 million frames each time.
 
     As Machado et al. (2018, https://arxiv.org/abs/1709.06009) recommend: actions are repeated with a probability of 0.25, an
     episode does not end with a life, and all 18 actions of the joystick can be taken, in all games. An action lasts for 4

@@ -40,7 +40,7 @@ def average_performance(task_averages: ArrayLike) -> float:
     :math:`J(\mathbb{T}) = \frac{1}{k} \sum_j J(\mathcal{T}_j)`, Eq. 1 of the C-CHAIN paper.
 
     :param task_averages: :math:`J(\mathcal{T}_j)`, the mean return over the training on each task, ``(n_tasks,)``:
-        :func:`~sb3_cchain.callbacks.continual_metrics.task_averages`
+        :func:`~sb3_cchain.callbacks.task_averages`
     :return: Their mean
     """
     return float(np.mean(np.asarray(task_averages, dtype=float)))
