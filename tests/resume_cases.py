@@ -142,7 +142,11 @@ class Case:
     def make_callbacks(self, folder: Path, save_freq: int, stop: Optional["Stop"]) -> list[BaseCallback]:
         """For ``learn()``."""
         continual = [TaskSync(), ContinualMetrics(folder / "returns.csv")] if self.continual else []
-        others = [*continual, *self.callbacks(), stop or Stop(float("inf"))]
+        own = self.callbacks()
+        for callback in own:
+            if isinstance(callback, EvalAllTasks):
+                callback.path = folder / "task_returns.csv"
+        others = [*continual, *own, stop or Stop(float("inf"))]
         checkpoint = TrainingCheckpoint(save_freq, folder / "checkpoints")
         return [*others, checkpoint] if self.checkpoint_last else [checkpoint, *others]
 

@@ -140,11 +140,12 @@ class ContinualGymControl(ContinualEnv):
         :param action: The action
         :return: Observation, reward, terminated, truncated, info
         """
-        observation, *rest = super().step(action)
-        return self._drifting(observation), *rest  # type: ignore[return-value]
+        observation, reward, terminated, truncated, info = super().step(action)
+        return self._drifting(observation), reward, terminated, truncated, info
 
     def _drifting(self, observation: NDArray) -> NDArray:
-        return observation + self._missing_offset if self._weights.get(self.task_id, 1.0) < 1 else observation
+        is_itself = not self.blend_steps or self._weights.get(self.task_id, 1.0) == 1
+        return observation if is_itself else observation + self._missing_offset
 
 
 def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
