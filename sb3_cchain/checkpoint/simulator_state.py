@@ -1,7 +1,4 @@
-"""
-The state of simulations that the attributes of an environment do not tell one by one: that of MuJoCo, in Gymnasium and
-dm_control, whose code is not Python, and that of MiniGrid, in which several attributes hold the same door or key.
-"""
+"""The state of simulations whose code is not Python: MuJoCo's, in Gymnasium and dm_control."""
 
 import sys
 import zlib
@@ -27,9 +24,6 @@ def register_simulators() -> None:
     if mujoco is not None:
         register_state(mujoco.MjModel, _model_state, _restore_model)
         register_state(mujoco.MjData, _data_state, _restore_data)
-    minigrid = sys.modules.get("minigrid.minigrid_env")
-    if minigrid is not None:
-        register_state(minigrid.MiniGridEnv, _minigrid_state, _restore_minigrid)
     engine = sys.modules.get("dm_control.mujoco.engine")
     if engine is not None:
         register_state(engine.Physics, _physics_state, _restore_physics)
@@ -43,21 +37,6 @@ def is_inexact(env: gym.Env) -> bool:
     """
     atari = sys.modules.get("ale_py")
     return atari is not None and isinstance(vars(env).get("ale"), atari.ALEInterface)
-
-
-# Attributes of MiniGrid that do not change or belong to its window
-_MINIGRID_SETTINGS = frozenset(
-    {"spec", "actions", "action_space", "observation_space", "render_mode", "render_size", "window", "clock"}
-)
-
-
-def _minigrid_state(env: gym.Env) -> dict[str, Any]:
-    # In one piece, so that what is the same object stays the same
-    return {name: value for name, value in vars(env).items() if name not in _MINIGRID_SETTINGS}
-
-
-def _restore_minigrid(env: gym.Env, state: dict[str, Any]) -> None:
-    vars(env).update(state)
 
 
 # Ids of data that the next reset empties before they are used
