@@ -3,13 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.analysis import EvalAllTasks
 from sb3_cchain.analysis.eval_all_tasks import read_task_returns
 from sb3_cchain.analysis.metrics.continual import return_matrix
@@ -154,6 +155,29 @@ def test_resumed_training_goes_on_with_the_rows(tmp_path):
     resumed = read_task_returns(tmp_path / "all.csv")
     assert resumed[: len(rows)] == rows
     assert [(row["timesteps"], row["trained_task"]) for row in resumed[::3]] == [(0, 0), (32, 0), (64, 1), (96, 2)]
+
+
+def test_pictures_and_processes():
+    """The evaluation environment is wrapped as Stable-Baselines3 wraps that of training, which may be in other processes."""
+
+    def pictures():
+        return ContinualEnv([lambda: RandomEnv(spaces.Box(0, 255, (36, 36, 3), np.uint8))] * 2, 16)
+
+    callback = EvalAllTasks(DummyVecEnv([pictures]), n_eval_episodes=1)
+    model = PPO("CnnPolicy", pictures(), **ARGUMENTS).learn(32, callback=[TaskSync(), callback])
+    assert callback.eval_env.observation_space.shape == (3, 36, 36) and len(model.task_returns) == 3 * 2
+    processes = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+    env = make_vec_env("Continual/CartPole-v1", 2, env_kwargs=CARTPOLE, **processes)
+    model = PPO("MlpPolicy", env, **ARGUMENTS).learn(64, callback=[TaskSync(), EvalAllTasks(n_eval_episodes=1)])
+    env.close()
+    assert [row["trained_task"] for row in model.task_returns[::3]] == [0, 0, 1]
+
+
+def test_tasks_are_the_environments_own_whatever_a_signal_says():
+    signal = TaskSignal(switch_every=1000)  # later than the tasks switch
+    model = PPO("MlpPolicy", tasks(), **ARGUMENTS)
+    model.learn(64, callback=[TaskSync(), signal, EvalAllTasks(tasks(), n_eval_episodes=1)])
+    assert [row["trained_task"] for row in model.task_returns[::3]] == [0, 0, 1]
 
 
 def test_charts():

@@ -21,7 +21,7 @@ from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import ReturnsFile, read_returns
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.evaluation import check_same_tasks
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, is_continual, require_continual, step_task
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info, is_continual, require_continual
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number
@@ -35,7 +35,8 @@ class EvalAllTasks(BaseCallback):
     Evaluates the agent on every task of a :class:`~sb3_cchain.ContinualEnv`: before training, whenever the task has switched,
     at the end of training and, if wanted, at intervals. It acts between rollouts: after the last update on a task, and before
     callbacks that come after it in the list, such as :class:`~sb3_cchain.methods.Oracle`, change the networks for the next.
-    Where a task ends within a rollout, it is up to a rollout late.
+    Where a task ends within a rollout, it is up to a rollout late. The tasks are the environment's own, whatever a
+    :class:`~sb3_cchain.TaskSignal` says. ``MaskablePPO`` is evaluated without masks.
 
     Logged are
 
@@ -100,7 +101,7 @@ class EvalAllTasks(BaseCallback):
     def _init_callback(self) -> None:
         require_continual(self)
         env = _make_eval_env(self.model) if self.eval_env is None else self.eval_env
-        self.eval_env = env if isinstance(env, VecEnv) else self.model._wrap_env(env, verbose=0)
+        self.eval_env = self.model._wrap_env(env, verbose=0)
         expected, given = self.training_env.observation_space, self.eval_env.observation_space
         if given.shape != expected.shape:
             raise ValueError(
@@ -127,7 +128,7 @@ class EvalAllTasks(BaseCallback):
         self._last_step = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        before, now = self._switch.task_id, episode_task(self.model)
+        before, now = self._switch.task_id, first_reset_info(self.training_env)[TASK_KEY]
         if self._switch.happened(now):
             self._evaluate(before)
         elif self._is_due():
@@ -137,7 +138,7 @@ class EvalAllTasks(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        self._trained_task = step_task(self.model, self.locals["infos"])
+        self._trained_task = self.locals["infos"][0][TASK_KEY]
 
     def _on_training_end(self) -> None:
         if self._trained_task is not None:
