@@ -138,7 +138,7 @@ def test_an_adam_step_after_it_by_hand():
 
 def test_from_discrete_to_continuous_actions_and_back():
     model = trained(PPO)
-    kept, new = transfer(model, gym.make("Pendulum-v1"))
+    kept, new = transfer(model, "Pendulum-v1")
     assert "log_std" in new and set(kept) == KEPT["ppo"]
     model.learn(32, reset_num_timesteps=False)
     _, new = transfer(model, gym.make("CartPole-v1"))

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
@@ -31,7 +31,7 @@ class Transferred(NamedTuple):
     new: list[str]
 
 
-def transfer(model: BaseAlgorithm, env: GymEnv, new_heads: bool = True) -> Transferred:
+def transfer(model: BaseAlgorithm, env: GymEnv | str, new_heads: bool = True) -> Transferred:
     """
     Train a model on in an environment with other observations or actions, from the same trunk: ``set_env()`` for spaces that
     differ. Call it between two calls of ``learn()``, the second with ``reset_num_timesteps=False``; that is a switch of task,
@@ -48,7 +48,7 @@ def transfer(model: BaseAlgorithm, env: GymEnv, new_heads: bool = True) -> Trans
     the actions and the environment are seeded with it plus the steps made so far.
 
     :param model: A model of PPO, A2C or DQN, or of a class that derives from them
-    :param env: The environment to train in next
+    :param env: The environment to train in next (if registered in Gym, can be str)
     :param new_heads: Whether the heads are drawn anew even where they fit
     :return: The names of what was kept and of what is new
     :raises TypeError: For a model of another algorithm
@@ -58,7 +58,7 @@ def transfer(model: BaseAlgorithm, env: GymEnv, new_heads: bool = True) -> Trans
     if not isinstance(model, (PPO, A2C, DQN)):
         raise TypeError(f"`model` must be of PPO, A2C, DQN or a class that derives from them, got {type(model).__name__}")
     check_bool("new_heads", new_heads)
-    env = model._wrap_env(env, model.verbose)
+    env = model._wrap_env(maybe_make_env(env, model.verbose), model.verbose)
     _check_spaces(model, env)
     old_policy = uncompiled(model.policy)
     before = dict(vars(model))
