@@ -119,7 +119,8 @@ class TaskSignal(BaseCallback):
             self.model.task_signal = {"task": 0, "reports": {}}  # type: ignore[attr-defined]
         self._start_time = self.model.start_time
         register_signal(self)
-        self._hear({**self._in_info(first_reset_info(self.training_env)), **self._between_steps()})
+        task_count(self.model)  # set_env() may have given another environment
+        self._hear(self._in_info(first_reset_info(self.training_env)), self._between_steps())
         self._step_task = self.next_task
 
     def _on_rollout_start(self) -> None:
@@ -134,9 +135,8 @@ class TaskSignal(BaseCallback):
         # The info tells of the step that was made, everything else of the next one
         self._hear(self._in_info(infos[0]))
         self._step_task = self.next_task
-        began = first_reset_info(self.training_env) if dones[0] else {}
-        self._hear({**self._in_info(began), **self._between_steps()})
-        if self._detector is not None and self.drift_of == "return":
+        self._hear(self._in_info(first_reset_info(self.training_env)) if dones[0] else {}, self._between_steps())
+        if self._detector is not None and self.drift_of == "return" and any(dones.tolist()):
             for index in np.flatnonzero(dones):
                 self._watch(_episode_return(infos[index]))
         return True
@@ -146,7 +146,7 @@ class TaskSignal(BaseCallback):
         return {"info": info[key]} if key in info else {}
 
     def _between_steps(self) -> dict[str, Any]:
-        reports: dict[str, Any] = {"count": task_count(self.model)}
+        reports: dict[str, Any] = {"count": self.model.task_count}  # type: ignore[attr-defined]
         if self.attribute is not None:
             # A copy: the environment may change it in place
             reports["attribute"] = deepcopy(self.training_env.get_attr(self.attribute, indices=0)[0])
@@ -156,15 +156,16 @@ class TaskSignal(BaseCallback):
             reports["schedule"] = bisect_right(self.switch_at, self.num_timesteps)
         return reports
 
-    def _hear(self, reports: dict[str, Any]) -> None:
-        """What a report says differently from the last time is a switch."""
-        state = self.model.task_signal  # type: ignore[attr-defined]
-        last = state["reports"]
-        if any(name in last and not _equal(last[name], report) for name, report in reports.items()):
-            state["task"] += 1
+    def _hear(self, *reports: dict[str, Any]) -> None:
+        """Where a report is another one than the last time, the task has switched."""
+        last, has_switched = self.model.task_signal["reports"], False  # type: ignore[attr-defined]
+        for name, report in [pair for each in reports for pair in each.items()]:
+            has_switched |= name in last and not _equal(last[name], report)
+            last[name] = report
+        if has_switched:
+            self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
             if self._detector is not None:
                 self._detector.reset()
-        last.update(reports)
 
     def _watch(self, value: float) -> None:
         assert self._detector is not None
@@ -173,9 +174,11 @@ class TaskSignal(BaseCallback):
 
 
 def _equal(a: Any, b: Any) -> bool:
+    if a is b:
+        return True
     if hasattr(a, "shape") or hasattr(b, "shape"):  # arrays, tensors and NumPy's numbers
         return np.array_equal(a, b)
-    return a is b or bool(a == b)
+    return bool(a == b)
 
 
 def _episode_return(info: dict[str, Any]) -> float:
