@@ -27,7 +27,7 @@ from sb3_cchain.tasks.drift import Drift
 N_TASKS = 3
 # What is watched, by its name in `drift_of`, and which of its values are worse
 WATCHED = {"return": "smaller", "train/value_loss": "greater", "churn/policy_churn": "greater"}
-DELTAS = (0.002, 1e-5)
+DELTAS = (0.002, 0.05)
 # Half the length of the pole in each task, m; CartPole-v1 has 0.5
 POLES = (0.5, 0.05, 2.0)
 SETTINGS = dict(n_steps=64, batch_size=128, n_epochs=5, learning_rate=1e-3, gamma=0.98, device="cpu")
