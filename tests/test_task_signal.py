@@ -365,6 +365,22 @@ def test_drift_of_a_logged_value():
     assert signal.next_task == 1
 
 
+@pytest.mark.parametrize("reason", ["drift", "call"])
+def test_the_detector_starts_over_when_methods_have_acted(reason):
+    """At the rollout after the switch, before it watches anything else."""
+    signal, events = TaskSignal(drift="adwin"), []
+    model = make_model("PPO", World())
+
+    def update(value):
+        events.append(("value", model.num_timesteps))
+        return reason == "drift" and model.num_timesteps == 20
+
+    signal._detector = SimpleNamespace(update=update, reset=lambda: events.append(("reset", model.num_timesteps)))
+    model.learn(48, [Curriculum(say if reason == "call" else lambda _: None, 20), signal])
+    assert [event for event in events if event[0] == "reset"] == [("reset", 32)]
+    assert signal.next_task == 1
+
+
 def test_river_is_asked_for(monkeypatch):
     original = builtins.__import__
 

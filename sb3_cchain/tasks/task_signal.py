@@ -38,7 +38,7 @@ class TaskSignal(BaseCallback):
       (https://doi.org/10.1137/1.9781611972771.42, Bifet & Gavaldà, 2007), which compares the older with the newer values of
       a window, of any length, and cuts it where their means differ. It is a switch when the newer values are worse: smaller
       returns, or otherwise greater values. What gets better is taken for learning. After each switch the detector starts
-      over.
+      over with the next rollout, when the methods have acted.
 
     The state is kept with the model, as ``model.task_signal``: a saved model that is trained further goes on counting, and
     hears of a change in the meantime. The detector starts over then, except where training is resumed exactly, from a
@@ -89,6 +89,7 @@ class TaskSignal(BaseCallback):
         self._detector = (
             None if drift is None else Drift(drift, drift_delta, worse="smaller" if drift_of == "return" else "greater")
         )
+        self._starts_over = False  # the detector, at the next rollout
         self._step_task = 0
 
     @property
@@ -125,6 +126,10 @@ class TaskSignal(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._hear(self._between_steps())
+        if self._detector is not None and self._starts_over:
+            # Only now: methods act here, and what they do to the agent is no drift
+            self._detector.reset()
+            self._starts_over = False
         if self._detector is not None and self.drift_of in self.logger.name_to_value:
             self._watch(self.logger.name_to_value[self.drift_of])  # what the update before this rollout logged
 
@@ -163,14 +168,16 @@ class TaskSignal(BaseCallback):
             has_switched |= name in last and not _equal(last[name], report)
             last[name] = report
         if has_switched:
-            self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
-            if self._detector is not None:
-                self._detector.reset()
+            self._begin_task()
 
     def _watch(self, value: float) -> None:
         assert self._detector is not None
         if self._detector.update(value):
-            self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
+            self._begin_task()
+
+    def _begin_task(self) -> None:
+        self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
+        self._starts_over = True
 
 
 def _equal(a: Any, b: Any) -> bool:
