@@ -292,6 +292,30 @@ def test_a_world_that_comes_back_is_a_new_task():
     assert list(dict.fromkeys(row["task_id"] for row in metrics.rows)) == [0, 1, 2]
 
 
+def test_an_attribute_that_is_changed_in_place():
+    class InPlace(CountEnv):
+        masses = np.ones(2)
+
+    oracle = Oracle()
+
+    def change(callback):
+        callback.training_env.get_attr("masses")[0][1] = 5
+
+    make_model("PPO", InPlace()).learn(48, [Curriculum(change, 20), TaskSignal(attribute="masses"), oracle])
+    assert oracle.n_resets == 1
+
+
+def test_a_loop_that_begins_as_any_training():
+    """The first ``learn()`` without ``reset_num_timesteps=False``, and a stock model with λ to reset."""
+    c_chain, oracle, resets = CChainCallback(reset_churn_coef=True), Oracle(), []
+    model = make_model("PPO", CountEnv())
+    for reset in (True, False, False):
+        model.learn(32, [TaskSignal(), ContinualMetrics(), c_chain, oracle], reset_num_timesteps=reset)
+        resets.append(oracle.n_resets)
+        model.set_env(CountEnv())
+    assert resets == [0, 1, 1] and model.continual_state["n_switches"] == 2
+
+
 @pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))])
 def test_environments_side_by_side(kwargs):
     oracle = Oracle()
