@@ -1,6 +1,7 @@
 """The detector of drift on series that are known, and what its benchmark makes of it."""
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,7 +67,9 @@ def test_alarms_are_told_from_false_ones(monkeypatch):
     monkeypatch.setattr(benchmark, "Drift", Every10)
     series = [(time, 0.0) for time in range(1, 41)]
     # At 5 nothing had changed, at 15 the first switch is 5 old, 25 is a second alarm of it, 35 is for the second switch
-    assert benchmark.alarms(series, [10, 30], 0.002, "smaller") == ([(5, 5), (5, 5)], 2, 2)
+    assert benchmark.alarms(series, [10, 30], 10, 0.002, "smaller") == ([(5, 5), (5, 5)], 2, 2)
+    # None comes in time
+    assert benchmark.alarms(series, [10, 30], 4, 0.002, "smaller") == ([], 2, 4)
 
 
 def test_the_benchmark_runs(tmp_path, capsys):
@@ -83,3 +86,9 @@ def test_poles_differ():
     env = benchmark.WORLDS["CartPole, poles of other lengths"](100)
     assert [task.unwrapped.length for task in env.tasks] == list(benchmark.POLES)
     assert [task.unwrapped.polemass_length for task in env.tasks] == pytest.approx([0.05, 0.005, 0.2])
+
+
+def test_the_page_shows_the_table():
+    root = Path(__file__).parent.parent
+    table = (root / "benchmarks" / "results" / "drift_3x20000" / "table.md").read_text()
+    assert table in (root / "docs" / "changing_world.md").read_text()

@@ -17,7 +17,14 @@ from benchmarks.grid.suites import SUITES
 from sb3_cchain import methods
 from sb3_cchain.algorithms import CChainDQN, CChainPPO
 from sb3_cchain.analysis import NetworkHealth
-from sb3_cchain.methods import OptimizerMetrics, OptimizerWrapper, Penalty
+from sb3_cchain.methods import (
+    EntropyBonusRestart,
+    ExplorationRateRestart,
+    LogStdRestart,
+    OptimizerMetrics,
+    OptimizerWrapper,
+    Penalty,
+)
 from sb3_cchain.methods.registry import BY_ALGO, FAMILY_PAGE, METHOD_NAMES, REGISTRY
 from tests.method_models import go_on, make_env, make_method
 
@@ -27,8 +34,8 @@ ROWS = pytest.mark.parametrize("method", REGISTRY, ids=lambda method: method.alg
 ROWS_IN_DISCRETE = pytest.mark.parametrize(
     "method", [method for method in REGISTRY if method.page != FAMILY_PAGE], ids=lambda method: method.algo
 )
-# Classes of `sb3_cchain.methods` that are parts of methods
-PARTS = {OptimizerMetrics, OptimizerWrapper, Penalty}
+# Classes of `sb3_cchain.methods` that are parts of methods, or go with any of them
+PARTS = {OptimizerMetrics, OptimizerWrapper, Penalty, ExplorationRateRestart, LogStdRestart, EntropyBonusRestart}
 
 
 def yaml_text(method):

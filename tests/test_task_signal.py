@@ -292,6 +292,30 @@ def test_a_world_that_comes_back_is_a_new_task():
     assert list(dict.fromkeys(row["task_id"] for row in metrics.rows)) == [0, 1, 2]
 
 
+def test_an_attribute_that_is_changed_in_place():
+    class InPlace(CountEnv):
+        masses = np.ones(2)
+
+    oracle = Oracle()
+
+    def change(callback):
+        callback.training_env.get_attr("masses")[0][1] = 5
+
+    make_model("PPO", InPlace()).learn(48, [Curriculum(change, 20), TaskSignal(attribute="masses"), oracle])
+    assert oracle.n_resets == 1
+
+
+def test_a_loop_that_begins_as_any_training():
+    """The first ``learn()`` without ``reset_num_timesteps=False``, and a stock model with λ to reset."""
+    c_chain, oracle, resets = CChainCallback(reset_churn_coef=True), Oracle(), []
+    model = make_model("PPO", CountEnv())
+    for reset in (True, False, False):
+        model.learn(32, [TaskSignal(), ContinualMetrics(), c_chain, oracle], reset_num_timesteps=reset)
+        resets.append(oracle.n_resets)
+        model.set_env(CountEnv())
+    assert resets == [0, 1, 1] and model.continual_state["n_switches"] == 2
+
+
 @pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))])
 def test_environments_side_by_side(kwargs):
     oracle = Oracle()
@@ -362,6 +386,22 @@ def test_drift_of_a_logged_value():
 
     model.learn(80, [signal, Spy()])
     assert heard == losses[1:] and len(heard) == 4
+    assert signal.next_task == 1
+
+
+@pytest.mark.parametrize("reason", ["drift", "call"])
+def test_the_detector_starts_over_when_methods_have_acted(reason):
+    """At the rollout after the switch, before it watches anything else."""
+    signal, events = TaskSignal(drift="adwin"), []
+    model = make_model("PPO", World())
+
+    def update(value):
+        events.append(("value", model.num_timesteps))
+        return reason == "drift" and model.num_timesteps == 20
+
+    signal._detector = SimpleNamespace(update=update, reset=lambda: events.append(("reset", model.num_timesteps)))
+    model.learn(48, [Curriculum(say if reason == "call" else lambda _: None, 20), signal])
+    assert [event for event in events if event[0] == "reset"] == [("reset", 32)]
     assert signal.next_task == 1
 
 

@@ -150,6 +150,7 @@ NEEDS = {
     "procgen": 'gymnasium.make("Continual/Starpilot-v0")',
     "zoo": "import sb3_cchain.zoo.cli",
     "contrib": "from sb3_cchain import CChainTQC",
+    "drift": "from sb3_cchain import TaskSignal; TaskSignal(drift='adwin')",
     "plots": "CChainPPO('MlpPolicy', 'CartPole-v1', n_steps=64).learn(64, callback=NTKCallback(picture_interval=1))",
 }
 

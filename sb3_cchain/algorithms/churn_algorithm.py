@@ -41,7 +41,7 @@ class ChurnAlgorithm(ZeroRateWarning):
     :param churn_window: Iterations that the running means of both losses cover. None is 50 for PPO, MaskablePPO, RecurrentPPO
         and TRPO, and 1000 for all others, A2C included, in which an iteration is one gradient update.
     :param churn_coef_min: Least value of λ once it adapts
-    :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the code
+    :param reset_churn_coef: Whether λ starts over (warm-up included) when the task switches, as in the code
         released with the paper. Off by default, because C-CHAIN does not need to be told of a switch.
     :param kwargs: Keyword arguments of the base algorithm
     :raises ValueError: Naming the churn argument that is out of its range

@@ -43,7 +43,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     :param churn_warmup: Gradient updates until λ adapts; with 0 it adapts after the first churn loss
     :param churn_window: Gradient updates that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
-    :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes
+    :param reset_churn_coef: Whether λ starts over (warm-up included) when the task switches
     :param churn_reference: Where reference batches are taken from, always drawn independently of the minibatch whose update
         they measure: ``"independent"`` for a sample of their own, ``"next"`` for the minibatch that is trained on next, which
         costs less because its outputs are needed anyway. Minibatches are then drawn one update ahead.

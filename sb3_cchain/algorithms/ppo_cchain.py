@@ -44,7 +44,7 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param churn_warmup: Iterations (rollout and ``train()``) until λ adapts
     :param churn_window: Iterations that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts
-    :param reset_churn_coef: Whether λ starts over (warm-up included) when ``info["task_id"]`` changes, as in the released
+    :param reset_churn_coef: Whether λ starts over (warm-up included) when the task switches, as in the released
         code. Off by default, because C-CHAIN does not need to be told of a switch.
     :param churn_base_loss: ``"actor"`` for the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
         ``"surrogate"`` for the clipped surrogate alone, as in its ProcGen

@@ -41,10 +41,13 @@ class ContinualMetrics(BaseCallback):
     that is resumed continues both. When training begins at step 0, a file that is there already is kept as ``<name>.1`` (or
     the next free number).
 
-    In an environment that is not continual the rewards are those before ``VecNormalize``. It is one task, and each further
-    environment that ``set_env()`` gives, followed by ``learn(..., reset_num_timesteps=False)``, is the next one.
+    In an environment that is not continual the rewards are those before ``VecNormalize``. Its tasks are those of a
+    :class:`~sb3_cchain.TaskSignal` before this callback. Without one, each further environment that ``set_env()`` gives,
+    followed by ``learn(..., reset_num_timesteps=False)``, is the next task. An episode that goes on over a switch counts for
+    the task in which it ends.
 
-    ``CChainPPO`` and ``CChainDQN`` add the callback by themselves in a continual environment. Give it to other algorithms.
+    ``CChainPPO`` and ``CChainDQN`` add the callback by themselves in a continual environment, and where there is a
+    ``TaskSignal``. Give it to other algorithms.
 
     :param path: The CSV file; by default ``returns.csv`` in the folder of the logs, if the model has ``tensorboard_log``
         or was given a logger by ``set_logger()``

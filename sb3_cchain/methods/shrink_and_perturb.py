@@ -37,8 +37,8 @@ class ShrinkAndPerturb(TaskBoundary):
     Logged: ``shrink_and_perturb/n_steps``, the steps since ``learn()`` was called.
 
     :param shrink: α
-    :param interval: Gradient updates (minibatches) between two steps; None for one step at each task switch of a continual
-        environment instead, for which α should be far smaller, such as 0.5
+    :param interval: Gradient updates (minibatches) between two steps; None for one step at each task switch instead,
+        for which α should be far smaller, such as 0.5
     :raises ValueError: When ``shrink`` is not between 0 and 1, or ``interval`` neither None nor a positive integer
     :raises TypeError: When training starts, for algorithms with several optimisers, and with ``interval=None`` for an
         environment that is not continual

@@ -47,7 +47,7 @@ class Drift:
         after = self._adwin.estimation
         has_become_worse = after < before if self.worse == "smaller" else after > before
         if has_become_worse:
-            self.reset()  # what a method does at the switch, such as a fresh network, is no drift
+            self.reset()
         return has_become_worse
 
     def state_dict(self) -> dict[str, Any]:

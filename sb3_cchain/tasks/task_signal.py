@@ -38,7 +38,7 @@ class TaskSignal(BaseCallback):
       (https://doi.org/10.1137/1.9781611972771.42, Bifet & Gavaldà, 2007), which compares the older with the newer values of
       a window, of any length, and cuts it where their means differ. It is a switch when the newer values are worse: smaller
       returns, or otherwise greater values. What gets better is taken for learning. After each switch the detector starts
-      over.
+      over with the next rollout, when the methods have acted.
 
     The state is kept with the model, as ``model.task_signal``: a saved model that is trained further goes on counting, and
     hears of a change in the meantime. The detector starts over then, except where training is resumed exactly, from a
@@ -89,6 +89,7 @@ class TaskSignal(BaseCallback):
         self._detector = (
             None if drift is None else Drift(drift, drift_delta, worse="smaller" if drift_of == "return" else "greater")
         )
+        self._starts_over = False  # the detector, at the next rollout
         self._step_task = 0
 
     @property
@@ -119,11 +120,16 @@ class TaskSignal(BaseCallback):
             self.model.task_signal = {"task": 0, "reports": {}}  # type: ignore[attr-defined]
         self._start_time = self.model.start_time
         register_signal(self)
-        self._hear({**self._in_info(first_reset_info(self.training_env)), **self._between_steps()})
+        task_count(self.model)  # set_env() may have given another environment
+        self._hear(self._in_info(first_reset_info(self.training_env)), self._between_steps())
         self._step_task = self.next_task
 
     def _on_rollout_start(self) -> None:
         self._hear(self._between_steps())
+        if self._detector is not None and self._starts_over:
+            # Only now: methods act here, and what they do to the agent is no drift
+            self._detector.reset()
+            self._starts_over = False
         if self._detector is not None and self.drift_of in self.logger.name_to_value:
             self._watch(self.logger.name_to_value[self.drift_of])  # what the update before this rollout logged
 
@@ -134,9 +140,8 @@ class TaskSignal(BaseCallback):
         # The info tells of the step that was made, everything else of the next one
         self._hear(self._in_info(infos[0]))
         self._step_task = self.next_task
-        began = first_reset_info(self.training_env) if dones[0] else {}
-        self._hear({**self._in_info(began), **self._between_steps()})
-        if self._detector is not None and self.drift_of == "return":
+        self._hear(self._in_info(first_reset_info(self.training_env)) if dones[0] else {}, self._between_steps())
+        if self._detector is not None and self.drift_of == "return" and any(dones.tolist()):
             for index in np.flatnonzero(dones):
                 self._watch(_episode_return(infos[index]))
         return True
@@ -146,7 +151,7 @@ class TaskSignal(BaseCallback):
         return {"info": info[key]} if key in info else {}
 
     def _between_steps(self) -> dict[str, Any]:
-        reports: dict[str, Any] = {"count": task_count(self.model)}
+        reports: dict[str, Any] = {"count": self.model.task_count}  # type: ignore[attr-defined]
         if self.attribute is not None:
             # A copy: the environment may change it in place
             reports["attribute"] = deepcopy(self.training_env.get_attr(self.attribute, indices=0)[0])
@@ -156,26 +161,31 @@ class TaskSignal(BaseCallback):
             reports["schedule"] = bisect_right(self.switch_at, self.num_timesteps)
         return reports
 
-    def _hear(self, reports: dict[str, Any]) -> None:
-        """What a report says differently from the last time is a switch."""
-        state = self.model.task_signal  # type: ignore[attr-defined]
-        last = state["reports"]
-        if any(name in last and not _equal(last[name], report) for name, report in reports.items()):
-            state["task"] += 1
-            if self._detector is not None:
-                self._detector.reset()
-        last.update(reports)
+    def _hear(self, *reports: dict[str, Any]) -> None:
+        """Where a report is another one than the last time, the task has switched."""
+        last, has_switched = self.model.task_signal["reports"], False  # type: ignore[attr-defined]
+        for name, report in [pair for each in reports for pair in each.items()]:
+            has_switched |= name in last and not _equal(last[name], report)
+            last[name] = report
+        if has_switched:
+            self._begin_task()
 
     def _watch(self, value: float) -> None:
         assert self._detector is not None
         if self._detector.update(value):
-            self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
+            self._begin_task()
+
+    def _begin_task(self) -> None:
+        self.model.task_signal["task"] += 1  # type: ignore[attr-defined]
+        self._starts_over = True
 
 
 def _equal(a: Any, b: Any) -> bool:
+    if a is b:
+        return True
     if hasattr(a, "shape") or hasattr(b, "shape"):  # arrays, tensors and NumPy's numbers
         return np.array_equal(a, b)
-    return a is b or bool(a == b)
+    return bool(a == b)
 
 
 def _episode_return(info: dict[str, Any]) -> float:
