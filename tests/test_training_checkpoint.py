@@ -1,6 +1,7 @@
 """Files and errors of TrainingCheckpoint, and what its signals do. That training goes on exactly is in ``test_resume.py``."""
 
 import json
+import multiprocessing
 import os
 import random
 import shutil
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -573,31 +575,69 @@ def test_signals_in_another_training_after_an_error(tmp_path, handlers):
     assert heard == [signal.SIGINT]
 
 
-class SendToAll(BaseCallback):
-    """Ctrl-C, as a terminal sends it: to the processes of the environments, too."""
+class InStep(BaseCallback):
+    """What happens to training in its twentieth step."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.happens = action
 
     def _on_step(self):
         if self.n_calls == 20:
-            os.killpg(0, signal.SIGINT)
+            self.happens()
         return True
 
 
-def train_until_interrupt(path):
-    """For another process."""
+def fail():
+    raise Stopped
+
+
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def run_group(path, exact, action):
+    """Training in a group of processes with those of its environments, which the script does not close."""
     os.setpgrp()
-    env = make_env(n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, wrapper_class=ResumableEnv)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.default_int_handler)
+    wrapper = dict(wrapper_class=ResumableEnv) if exact else {}
+    env = make_env(n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, **wrapper)
+    make(env).learn(STEPS, [TrainingCheckpoint(10**6, path, exact=exact), InStep(action)])
+
+
+def is_there(group):
     try:
-        make(env).learn(STEPS, [TrainingCheckpoint(10**6, path), SendToAll()])
-    except KeyboardInterrupt:
-        return find_checkpoint(path).num_timesteps
-    finally:
-        env.close()
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+# What happens, the exit code, and whether training is saved
+GROUP_CASES = {
+    "Ctrl-C": (partial(os.killpg, 0, signal.SIGINT), 1, True),
+    "SIGTERM": (partial(os.killpg, 0, signal.SIGTERM), 143, True),
+    "error": (fail, 1, False),
+    "kill": (kill, -signal.SIGKILL, False),
+}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs groups of processes")
-def test_an_interrupt_of_all_processes(tmp_path):
-    assert in_new_process(train_until_interrupt, tmp_path) == 64
+@pytest.mark.parametrize("exact", [True, False], ids=["exact", "new episodes"])
+@pytest.mark.parametrize("name", GROUP_CASES)
+def test_processes_of_environments_live_as_long_as_training(tmp_path, name, exact):
+    """Not shorter, so that it can be saved, and not longer."""
+    action, exit_code, is_saved = GROUP_CASES[name]
+    process = multiprocessing.get_context("forkserver").Process(target=run_group, args=(tmp_path, exact, action))
+    process.start()
+    process.join(60)
+    assert process.exitcode == exit_code
+    assert names(tmp_path) == ([f"step_{64:012d}"] if is_saved else [])
+    deadline = time.monotonic() + 10
+    while is_there(process.pid):
+        assert time.monotonic() < deadline, "a process of an environment is left"
+        time.sleep(0.01)
 
 
 # --- Kills ---------------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, has_checkpoint, package_versions
+from sb3_cchain.checkpoint.environment_processes import live_as_long_as_training
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
 from sb3_cchain.checkpoint.files import sync_files
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
@@ -147,9 +148,10 @@ class TrainingCheckpoint(BaseCallback):
         else:
             self._check_resumed(self._resumed)
             self._seconds_before = self._resumed.seconds
-        if self.exact:
-            for name, env in self._parts.envs.items():
+        for name, env in self._parts.envs.items():
+            if self.exact:
                 self._prepare(name, env)
+            live_as_long_as_training(env)
         in_same_folder = self._resumed is not None and self._resumed.folder.resolve() == self.path.resolve()
         newest = self._resumed.num_timesteps if self._resumed is not None and in_same_folder else None
         self._folder = CheckpointFolder(self.path, self.keep, newest)
