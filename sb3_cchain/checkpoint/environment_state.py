@@ -36,7 +36,6 @@ def prepare_environment(env: VecEnv) -> None:
     base = env.unwrapped
     if isinstance(base, SubprocVecEnv):
         _check_outermost(base)
-        base.env_method("ignore_interrupts")
         for position, fault in enumerate(base.env_method("resume_fault")):
             _raise(position, fault)
     elif isinstance(base, DummyVecEnv):

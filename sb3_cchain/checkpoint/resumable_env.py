@@ -1,6 +1,5 @@
 """The state of a single environment with its wrappers."""
 
-import signal
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -65,10 +64,6 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         :raises ValueError: When the environment is another one
         """
         restore_single_environment(self, state)
-
-    def ignore_interrupts(self) -> None:
-        """For the process of an environment. A terminal sends Ctrl-C to it, too, but training has to be completed first."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def resume_fault(self) -> str | None:
         """
