@@ -19,7 +19,7 @@ from platform import python_version
 from typing import Any, TextIO
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
-from sb3_cchain.checkpoint.files import sync_folder, write_safely
+from sb3_cchain.checkpoint.files import check_path, check_writable, sync_folder, write_safely
 from sb3_cchain.locked_file import open_locked
 
 # Of the files. A later version of the package reads it, or says that it does not
@@ -109,11 +109,13 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
     """
     :param path: A checkpoint, or a folder of checkpoints
     :return: The checkpoint, or the newest whole one in the folder
-    :raises ValueError: When there is none, or the one given is damaged
+    :raises TypeError: When it is no path
+    :raises ValueError: When there is none, or all are damaged, naming what is wrong with each
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_dir():
-        raise ValueError(f"{path} is not a checkpoint of a training, nor a folder of checkpoints: there is no such folder")
+        reason = "it is a file" if path.exists() else "there is no such folder"
+        raise ValueError(f"{path} is not a checkpoint of a training, nor a folder of checkpoints: {reason}")
     candidates = _step_folders(path)
     if not candidates:
         try:
@@ -122,12 +124,17 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
             whole = next(filter(None, map(_whole, _step_folders(path.parent))), None)
             advice = "" if whole is None else f". The newest whole checkpoint beside it is {whole.path}"
             raise ValueError(f"{error}{advice}") from None
+    faults = []
     for candidate in candidates:
         try:
-            return Checkpoint(candidate)
+            checkpoint = Checkpoint(candidate)
         except ValueError as error:
-            warnings.warn(f"{error}. An older checkpoint is taken instead.")
-    raise ValueError(f"{path} holds no whole checkpoint")
+            faults.append(str(error))
+            continue
+        for fault in faults:
+            warnings.warn(f"{fault}. An older checkpoint is taken instead.")
+        return checkpoint
+    raise ValueError(f"{path} holds no whole checkpoint: {'; '.join(faults)}")
 
 
 def has_checkpoint(path: str | Path) -> bool:
@@ -165,12 +172,15 @@ class CheckpointFolder:
     :param path: The folder; it is made if it does not exist
     :param keep: How many checkpoints stay
     :param newest: Step of the newest checkpoint that may be there; None when there must be none
-    :raises ValueError: When another training writes to it, or there are later checkpoints in it
+    :raises ValueError: When nothing can be written to it, another training writes to it, or there are later checkpoints in it
     """
 
     def __init__(self, path: Path, keep: int, newest: int | None = None):
         self.path, self.keep = path, keep
-        path.mkdir(parents=True, exist_ok=True)
+        try:
+            check_writable(path)
+        except OSError as error:
+            raise ValueError(f"`path` must be a folder that can be written to, got {str(path)!r}: {error}") from error
         message = f"Another process is writing checkpoints to {path}. Give each training a `path` of its own."
         self._lock: TextIO = open_locked(path / ".lock", message)
         try:
@@ -186,7 +196,8 @@ class CheckpointFolder:
         if newest is None and there:
             raise ValueError(
                 f"`path` holds checkpoints of another training already, the newest of which is {there[0]}. Go on from it by "
-                "resume(), give another path, or move them away."
+                "resume(), or with the same model by learn(..., reset_num_timesteps=False), give another path, or move them "
+                "away."
             )
         later = [folder for folder in there if newest is not None and folder.name > step_name(newest)]
         for folder in [folder for folder in later if _whole(folder) is None]:
@@ -225,8 +236,7 @@ class CheckpointFolder:
         with write_safely(unfinished / STATE) as path, open(path, "wb") as file:
             pickle.dump(state, file, protocol=5)
         files = {name: _hash(unfinished / name) for name in (MODEL, STATE)}
-        with write_safely(unfinished / INFO) as path:
-            path.write_text(json.dumps({"format": FORMAT, **info, "files": files}, indent=1) + "\n")
+        write_info(unfinished, {"format": FORMAT, **info, "files": files})
         os.rename(unfinished, target)
         sync_folder(self.path)
         self._remove_old()
@@ -276,14 +286,33 @@ def _read_info(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise ValueError(f"{path} is not a checkpoint of a training: it has no {INFO}")
     try:
-        info: dict[str, Any] = json.loads(file.read_text())
+        text = file.read_text()
+        info: dict[str, Any] = json.loads(text)
         found = info["format"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error
     if found != FORMAT:
         made_with = info.get("versions", {}).get("sb3-cchain", "an unknown version")
         raise ValueError(f"{path} has the format {found} of sb3-cchain {made_with}; this version reads the format {FORMAT}")
+    info.pop("checksum", None)
+    if text != _info_text(info):
+        raise ValueError(f"{file} is damaged: it is not what was written")
     return info
+
+
+def write_info(path: Path, info: Mapping[str, Any]) -> None:
+    """
+    :param path: Folder of a checkpoint
+    :param info: What is known about it
+    """
+    with write_safely(path / INFO) as file:
+        file.write_text(_info_text(info))
+
+
+def _info_text(info: Mapping[str, Any]) -> str:
+    """The file's content, with a checksum of the rest."""
+    checksum = hashlib.sha256(json.dumps(info).encode()).hexdigest()
+    return json.dumps({**info, "checksum": checksum}, indent=1) + "\n"
 
 
 def _hash(file: Path) -> str:
