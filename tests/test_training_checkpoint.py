@@ -1,5 +1,6 @@
 """Files and errors of TrainingCheckpoint, and what its signals do. That training goes on exactly is in ``test_resume.py``."""
 
+import csv
 import json
 import multiprocessing
 import os
@@ -18,12 +19,14 @@ import torch as th
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cchain import CChainCallback, ChurnMonitor, TrainingCheckpoint, resume
 from sb3_cchain.checkpoint import ResumableEnv, find_checkpoint, load_model
-from sb3_cchain.checkpoint.checkpoint_folder import CheckpointFolder
-from tests.resume_cases import Stop, Stopped, in_new_process
+from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
+from sb3_cchain.envs import TaskVecNormalize
+from tests.resume_cases import Record, Stop, Stopped, in_new_process
 
 ARGUMENTS = dict(n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu")
 DQN_ARGUMENTS = dict(
@@ -214,6 +217,28 @@ def test_the_log_goes_on_in_its_folder(tmp_path):
     assert len(list((tmp_path / "logs" / "PPO_1").iterdir())) == 2
 
 
+def test_other_logs_go_on_in_new_files(tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path / "logs"), ["csv", "json", "log"]))
+    train(model, tmp_path / "checkpoints")
+    before = (tmp_path / "logs" / "progress.csv").read_text()
+    go_on(tmp_path / "checkpoints")
+    with open(tmp_path / "logs" / f"progress_from_step_{NEWEST}.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert (tmp_path / "logs" / "progress.csv").read_text() == before
+    assert [row["time/total_timesteps"] for row in rows] == ["112", "128", "144", "160"]
+    assert len(list((tmp_path / "logs").iterdir())) == 6
+
+
+def test_a_log_that_cannot_be_made_again(tmp_path):
+    model = make()
+    model.set_logger(Logger(None, [Record()]))
+    train(model, tmp_path)
+    with pytest.warns(UserWarning, match="also logged by Record, which only you can make again: give `logger`"):
+        go_on(tmp_path)
+    go_on(tmp_path, total_timesteps=STEPS + 16, logger=Logger(None, [Record()]))
+
+
 # --- Folders of others ---------------------------------------------------------------------------------------------------
 
 
@@ -262,6 +287,54 @@ def test_after_an_error_the_same_process_may_train_again(path, tmp_path):
     assert go_on(tmp_path / "new").num_timesteps == STEPS
 
 
+# --- In several calls of learn() -----------------------------------------------------------------------------------------
+
+
+def learn_in_pieces(model, make_callback, n_pieces=5):
+    for _ in range(n_pieces):
+        model.learn(STEPS // 5, make_callback(), reset_num_timesteps=False)
+    return model
+
+
+@pytest.mark.parametrize("create", [make, make_dqn])
+@pytest.mark.parametrize("is_one", [True, False], ids=["one callback", "new callbacks"])
+def test_several_calls_are_one_training(tmp_path, create, is_one):
+    """Its checkpoints do not depend on where a call ends, and it goes on to the end of the present call."""
+    expected = learn_in_pieces(create(), list)
+    one = TrainingCheckpoint(48, tmp_path)
+    model = learn_in_pieces(create(), lambda: [one if is_one else TrainingCheckpoint(48, tmp_path)])
+    assert_same(model, expected)
+    assert names(tmp_path) == [f"step_{number:012d}" for number in (NEWEST, 144)]
+    assert find_checkpoint(tmp_path).seconds > find_checkpoint(step(tmp_path, NEWEST)).seconds
+    shutil.rmtree(step(tmp_path, 144))
+    resumed = resume(tmp_path, make_env(), TrainingCheckpoint(48, tmp_path), device="cpu")
+    assert resumed.num_timesteps == 128
+    resumed.learn(STEPS - 128, TrainingCheckpoint(48, tmp_path), reset_num_timesteps=False)
+    assert_same(resumed, expected)
+    assert names(tmp_path) == [f"step_{number:012d}" for number in (NEWEST, 144)]
+
+
+def test_another_training_of_the_same_model_is_refused(tmp_path):
+    model = make()
+    model.learn(64, TrainingCheckpoint(32, tmp_path))
+    with pytest.raises(ValueError, match="`path` holds checkpoints of another training"):
+        model.learn(64, TrainingCheckpoint(32, tmp_path))
+
+
+def test_training_that_goes_on_does_not_begin_to_count(path):
+    checkpoint = find_checkpoint(path)
+    callbacks = [TrainingCheckpoint.resume_from(checkpoint), Stop(float("inf"))]
+    with pytest.raises(ValueError, match="reset_num_timesteps=False"):
+        load_model(checkpoint, make_env(), "cpu").learn(64, callbacks)
+
+
+@pytest.mark.parametrize("log_interval, saved", [(1, [96, 144]), (2, [64, 128]), (5, [80]), (1000, [96]), (None, [96, 144])])
+def test_it_waits_for_the_log_but_not_too_long(tmp_path, log_interval, saved):
+    """Rollouts have 16 steps."""
+    make().learn(STEPS, TrainingCheckpoint(48, tmp_path), log_interval=log_interval)
+    assert names(tmp_path) == [f"step_{number:012d}" for number in saved]
+
+
 # --- Damage --------------------------------------------------------------------------------------------------------------
 
 
@@ -281,8 +354,9 @@ def damage(file, kind):
 @pytest.mark.parametrize(
     "name, kind",
     [
-        *((name, kind) for name in ("model.zip", "training.pkl") for kind in ("missing", "torn", "empty", "flipped")),
-        *(("checkpoint.json", kind) for kind in ("missing", "torn", "empty")),
+        (name, kind)
+        for name in ("model.zip", "training.pkl", "checkpoint.json")
+        for kind in ("missing", "torn", "empty", "flipped")
     ],
 )
 def test_a_damaged_checkpoint(path, name, kind):
@@ -292,7 +366,7 @@ def test_a_damaged_checkpoint(path, name, kind):
     with pytest.warns(UserWarning, match=rf"{name}.*An older checkpoint is taken instead"):
         assert find_checkpoint(path).num_timesteps == BEFORE
     damage(step(path, BEFORE) / name, kind)
-    with pytest.warns(UserWarning), pytest.raises(ValueError, match="holds no whole checkpoint"):
+    with pytest.raises(ValueError, match=rf"holds no whole checkpoint: .*{NEWEST}.*{name}.*; .*{BEFORE}.*{name}"):
         find_checkpoint(path)
     with pytest.raises(ValueError, match=name) as raised:
         find_checkpoint(step(path, NEWEST))
@@ -348,13 +422,23 @@ def test_something_else_is_no_checkpoint(tmp_path):
 
 
 def change_info(folder, **changes):
-    file = folder / "checkpoint.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+    """As another training would have written it."""
+    content = json.loads((folder / "checkpoint.json").read_text())
+    del content["checksum"]
+    write_info(folder, {**content, **changes})
 
 
 def test_another_format(path):
-    change_info(step(path, NEWEST), format=2)
-    with pytest.raises(ValueError, match=r"has the format 2 of sb3-cchain \S+; this version reads the format 1"):
+    change_info(step(path, NEWEST), format=FORMAT + 1)
+    message = rf"has the format {FORMAT + 1} of sb3-cchain \S+; this version reads the format {FORMAT}"
+    with pytest.raises(ValueError, match=message):
+        find_checkpoint(step(path, NEWEST))
+
+
+def test_a_changed_number_is_noticed(path):
+    file = step(path, NEWEST) / "checkpoint.json"
+    file.write_text(file.read_text().replace(f'"num_timesteps": {NEWEST}', f'"num_timesteps": {NEWEST - 1}'))
+    with pytest.raises(ValueError, match=f"{file} is damaged: it is not what was written"):
         find_checkpoint(step(path, NEWEST))
 
 
@@ -436,11 +520,19 @@ def test_a_finished_training(path):
         (dict(save_freq=1.5), "`save_freq` must be .*got 1.5"),
         (dict(keep=0), "`keep` must be .*got 0"),
         (dict(exact="yes"), "`exact` must be .*got 'yes'"),
+        (dict(path=None), "`path` must be a path, got None"),
     ],
 )
 def test_wrong_arguments(tmp_path, arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         TrainingCheckpoint(**{"save_freq": 10, "path": tmp_path, **arguments})
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "inside"):
+        with pytest.raises(ValueError, match=rf"`path` must be a folder that can be written to, got '{path}'"):
+            make().learn(STEPS, TrainingCheckpoint(16, path))
 
 
 def test_two_of_them(tmp_path):
@@ -462,24 +554,73 @@ def test_environments_in_processes_need_a_wrapper(tmp_path, handlers):
     env.close()
 
 
-def test_new_episodes_where_exactness_is_not_wanted(tmp_path):
-    train(make(), tmp_path, exact=False)
-    env = make_env()
-    episodes = []
+class Watch(BaseCallback):
+    """What training finds at the start of its first rollout."""
 
-    class Watch(Stop):
-        def _on_rollout_start(self):
-            episodes.append(env.envs[0].unwrapped.state.copy())
-            episodes.append(self.model._last_obs[0].copy())
+    def __init__(self, look):
+        super().__init__()
+        self.looks, self.found = look, None
 
-    Watch.__name__ = "Stop"
-    given = [TrainingCheckpoint(32, tmp_path, exact=False), Watch(float("inf"))]
+    def _on_rollout_start(self):
+        if self.found is None:
+            self.found = self.looks(self.model)
+
+    def _on_step(self):
+        return True
+
+
+def begin_new_episodes(path, make_model, make_training_env, look):
+    """Train, go on with new episodes, and look at the beginning."""
+    env = make_training_env()
+    make_model(env).learn(STEPS, [TrainingCheckpoint(NEWEST, path, exact=False), Watch(lambda model: None)])
+    env.close()
+    env, watch = make_training_env(), Watch(look)
     with pytest.warns(UserWarning, match="begin new episodes"):
-        model = resume(tmp_path, env, given, device="cpu")
-    # The environment and the model agree on where the episode is, and all environments are at their beginning
-    assert abs(episodes[0] - episodes[1]).max() < 1e-6 and abs(episodes[0]).max() <= 0.05
+        model = resume(path, env, [TrainingCheckpoint(NEWEST, path, exact=False), watch], device="cpu")
+    env.close()
     assert model.num_timesteps == STEPS
-    assert find_checkpoint(tmp_path).info["training_checkpoint"]["exact"] is False
+    assert find_checkpoint(path).info["training_checkpoint"]["exact"] is False
+    return watch.found
+
+
+def test_new_episodes_where_exactness_is_not_wanted(tmp_path):
+    def look(model):
+        return model.env.envs[0].unwrapped.state, model._last_obs[0], model._last_episode_starts
+
+    state, observation, starts = begin_new_episodes(tmp_path, make, make_env, look)
+    # The environment and the model agree on where the episode is, and it is at its beginning
+    assert abs(state - observation).max() < 1e-6 and abs(state).max() <= 0.05 and starts.all()
+
+
+@pytest.mark.parametrize("wrapper", [VecNormalize, TaskVecNormalize])
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_tasks_and_statistics_outlast_episodes(tmp_path, wrapper, vec_env_cls):
+    def make_training_env():
+        kwargs = dict(env_kwargs=dict(steps_per_task=60, n_tasks=3, n_envs=2))
+        if vec_env_cls is SubprocVecEnv:
+            kwargs["vec_env_kwargs"] = {"start_method": "fork"}
+        return wrapper(make_env("Continual/CartPole-v1", n_envs=2, vec_env_cls=vec_env_cls, **kwargs))
+
+    def look(model):
+        clocks = model.env.get_attr("clock")
+        times = [(clock.n_steps, clock.task_id) for clock in clocks]
+        return times, model.env.obs_rms.count, model.env.returns.tolist(), model._last_episode_starts
+
+    times, count, returns, starts = begin_new_episodes(tmp_path, make, make_training_env, look)
+    # The second of tasks of 60 steps
+    assert times == [(NEWEST, 1)] * 2
+    # Observations of all steps, or of those of the task; and those at the start of the training and of the new episodes
+    assert count == pytest.approx(NEWEST + 4 if wrapper is VecNormalize else NEWEST - 60 + 4, abs=1e-3)
+    assert returns == [0, 0] and starts.all()
+
+
+def test_new_episodes_do_not_follow_on_the_replay_buffer(tmp_path):
+    def look(model):
+        buffer = model.replay_buffer
+        return buffer.pos, buffer.dones[buffer.pos - 1].tolist(), buffer.timeouts[buffer.pos - 1].tolist()
+
+    position, done, timeout = begin_new_episodes(tmp_path, make_dqn, make_env, look)
+    assert (position, done, timeout) == (NEWEST, [1], [1])
 
 
 # --- Signals -------------------------------------------------------------------------------------------------------------

@@ -7,11 +7,12 @@ import gymnasium as gym
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
+from sb3_cchain.checkpoint.log import further_logger
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.validation import check_number
@@ -39,8 +40,8 @@ def resume(
         TrainingCheckpoint may be left out where it was the last
     :param total_timesteps: Environment steps at which training ends, those before the interruption included; by default as
         before
-    :param logger: The logger. By default the model logs to the screen and to its folder for TensorBoard, if it has one. A
-        logger of another kind has to be given again, with a new folder, as SB3's CSV file starts anew
+    :param logger: The logger. By default the model logs to the same folder in the same formats. Files that SB3 would overwrite
+        are new ones, such as ``progress_from_step_50000.csv``
     :param device: PyTorch device
     :return: The trained model
     :raises ValueError: When there is no whole checkpoint, when the training was at its end already, or naming what differs
@@ -60,8 +61,8 @@ def resume(
     made = maybe_make_env(env, verbose=0)
     assert made is not None
     model = load_model(checkpoint, made, device)
-    if logger is None and model.tensorboard_log is not None and checkpoint.info["log_folder"] is not None:
-        logger = configure(checkpoint.info["log_folder"], ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
+    if logger is None:
+        logger = further_logger(checkpoint.info["log"], checkpoint.num_timesteps)
     if logger is not None:
         model.set_logger(logger)
     callbacks = with_checkpoint(_as_list(callback), checkpoint)

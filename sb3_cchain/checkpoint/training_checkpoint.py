@@ -8,7 +8,8 @@ import time
 import warnings
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -19,7 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, has_checkpoint, package_versions
 from sb3_cchain.checkpoint.environment_processes import live_as_long_as_training
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
-from sb3_cchain.checkpoint.files import sync_files
+from sb3_cchain.checkpoint.files import check_path, sync_files
+from sb3_cchain.checkpoint.log import describe_log
+from sb3_cchain.checkpoint.new_episodes import begin_new_episodes, lasting_state
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
 from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
 from sb3_cchain.tasks.callback_tree import require_single
@@ -27,6 +30,15 @@ from sb3_cchain.validation import check_bool, check_number
 
 DIFFERENT = "Make the training as it was, or load the model as usual, which begins new episodes."
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class _Progress(NamedTuple):
+    last_saved: int
+    seconds: float
+
+
+# How far each model has come that this process trains, by the folders of checkpoints
+_progress: WeakKeyDictionary[BaseAlgorithm, dict[Path, _Progress]] = WeakKeyDictionary()
 
 
 class TrainingCheckpoint(BaseCallback):
@@ -41,7 +53,10 @@ class TrainingCheckpoint(BaseCallback):
     changes nothing: training is complete then.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
-    the same rhythm; when it is told to stop, it does not wait.
+    the same rhythm. It waits for ``save_freq`` steps at the most, and not at all when it is told to stop.
+
+    A training may consist of several calls of ``learn(..., reset_num_timesteps=False)`` of one model, with the same callback
+    or with new ones of the same ``path``.
 
     Works with all algorithms of Stable-Baselines3 and sb3-contrib but ARS. The page "Stop and resume" says what is exact.
 
@@ -50,9 +65,9 @@ class TrainingCheckpoint(BaseCallback):
     :param keep: How many checkpoints stay
     :param exact: Whether environments that cannot be resumed in the middle of an episode are refused. Otherwise all
         environments begin new episodes when training is resumed
-    :raises TypeError: When training starts, for ARS
+    :raises TypeError: Naming the argument that is of another type. When training starts, for ARS
     :raises ValueError: Naming the argument that is out of its range. When training starts: for environments that cannot be
-        resumed exactly, a folder of another training, or a second TrainingCheckpoint
+        resumed exactly, a folder of another training or one that cannot be written to, or a second TrainingCheckpoint
     """
 
     def __init__(self, save_freq: int, path: str | Path, keep: int = 2, exact: bool = True):
@@ -61,7 +76,7 @@ class TrainingCheckpoint(BaseCallback):
         check_number("keep", keep, 1, integer=True)
         check_bool("exact", exact)
         self.save_freq = save_freq
-        self.path = Path(path)
+        self.path = check_path("path", path)
         self.keep = keep
         self.exact = exact
         # How to go on, as it is printed when training was told to stop
@@ -111,15 +126,14 @@ class TrainingCheckpoint(BaseCallback):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: The time of the last checkpoint
+        :return: Its counters
         """
-        return {"last_saved": self._last_saved, "num_timesteps": self.num_timesteps, "n_calls": self.n_calls}
+        return {"num_timesteps": self.num_timesteps, "n_calls": self.n_calls}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: What :meth:`state_dict` returned
         """
-        self._last_saved = state["last_saved"]
         self.num_timesteps, self.n_calls = state["num_timesteps"], state["n_calls"]
 
     def _init_callback(self) -> None:
@@ -143,19 +157,42 @@ class TrainingCheckpoint(BaseCallback):
         self._n_rollouts, self._stop_signal = 0, None
         self._parts = training_parts(self.model, self.locals["callback"])
         self._environment = describe_env(self.training_env)
-        if self._resumed is None:
-            self._last_saved = self.num_timesteps
-        else:
-            self._check_resumed(self._resumed)
-            self._seconds_before = self._resumed.seconds
+        newest = self._begin() if self._resumed is None else self._go_on(self._resumed)
         for name, env in self._parts.envs.items():
             if self.exact:
                 self._prepare(name, env)
             live_as_long_as_training(env)
-        in_same_folder = self._resumed is not None and self._resumed.folder.resolve() == self.path.resolve()
-        newest = self._resumed.num_timesteps if self._resumed is not None and in_same_folder else None
         self._folder = CheckpointFolder(self.path, self.keep, newest)
+        self._note_progress()
         self._listen_to_signals()
+
+    def _begin(self) -> int | None:
+        """
+        :return: Step of the newest checkpoint that may be in the folder; None when there must be none
+        """
+        earlier = None if self.locals["reset_num_timesteps"] else _progress.get(self.model, {}).get(self.path.resolve())
+        if earlier is None:
+            self._last_saved, self._seconds_before = self.num_timesteps, 0.0
+            return None
+        self._last_saved, self._seconds_before = earlier
+        return self.num_timesteps
+
+    def _go_on(self, checkpoint: Checkpoint) -> int | None:
+        """
+        :param checkpoint: The checkpoint to go on from
+        :return: See :meth:`_begin`
+        """
+        if self.locals["reset_num_timesteps"]:
+            raise ValueError("Training that goes on from a checkpoint needs learn(..., reset_num_timesteps=False)")
+        checkpoint.warn_of_other_versions()
+        saved = checkpoint.info
+        check_same(saved["environment"], self._environment, DIFFERENT)
+        check_same(saved["callbacks"], describe_callbacks(self._parts.callbacks), "Give the same callbacks in the same order.")
+        self._last_saved, self._seconds_before = checkpoint.num_timesteps, checkpoint.seconds
+        return checkpoint.num_timesteps if checkpoint.folder.resolve() == self.path.resolve() else None
+
+    def _note_progress(self) -> None:
+        _progress.setdefault(self.model, {})[self.path.resolve()] = _Progress(self._last_saved, self.seconds)
 
     def _prepare(self, name: str, env: VecEnv) -> None:
         try:
@@ -165,18 +202,16 @@ class TrainingCheckpoint(BaseCallback):
             where = "training environment" if owner is None else f"environment of {type(owner).__name__}"
             raise ValueError(f"The {where} cannot be resumed exactly. {error}") from error
 
-    def _check_resumed(self, checkpoint: Checkpoint) -> None:
-        checkpoint.warn_of_other_versions()
-        saved = checkpoint.info
-        check_same(saved["environment"], self._environment, DIFFERENT)
-        check_same(saved["callbacks"], describe_callbacks(self._parts.callbacks), "Give the same callbacks in the same order.")
-
     def _on_rollout_start(self) -> None:
         if self._resumed is not None:
             checkpoint, self._resumed = self._resumed, None
-            if not checkpoint.info["training_checkpoint"]["exact"]:
+            exact = checkpoint.info["training_checkpoint"]["exact"]
+            if not exact:
                 warnings.warn("All environments begin new episodes, so that training goes on, but not exactly (exact=False).")
-            restore_training(self._parts, checkpoint.read_state(), checkpoint.model_path, checkpoint.store)
+            state = checkpoint.read_state()
+            restore_training(self._parts, state, checkpoint.model_path, checkpoint.store)
+            if not exact:
+                begin_new_episodes(self.model, self._parts.envs, state["lasting"])
         elif self._stop_signal is not None:
             self._stop()
         elif self._is_due():
@@ -191,14 +226,15 @@ class TrainingCheckpoint(BaseCallback):
     def _on_training_end(self) -> None:
         if self._stop_signal is not None:
             print("That was the last rollout: training is complete, and goes on to what comes after it", flush=True)
+        self._note_progress()
         self._release()
 
     def _is_due(self) -> bool:
-        if self.num_timesteps - self._last_saved < self.save_freq:
-            return False
+        n_steps = self.num_timesteps - self._last_saved
         # The training loop of on-policy algorithms counts its iterations from 0 when training is resumed
-        log_interval = self.locals["log_interval"] if isinstance(self.model, OnPolicyAlgorithm) else None
-        return (not log_interval or self._n_rollouts % log_interval == 0) and self._can_save()
+        log_interval = (isinstance(self.model, OnPolicyAlgorithm) and self.locals["log_interval"]) or 1
+        may_wait = self._n_rollouts % log_interval != 0
+        return n_steps >= (2 * self.save_freq if may_wait else self.save_freq) and self._can_save()
 
     def _can_save(self) -> bool:
         return not self.exact or all(map(can_save_environment, self._parts.envs.values()))
@@ -207,6 +243,8 @@ class TrainingCheckpoint(BaseCallback):
         assert self._folder is not None
         self._last_saved = self.num_timesteps
         state, left_out = training_state(self._parts, self._folder.store, with_envs=self.exact)
+        if not self.exact:
+            state["lasting"] = {name: lasting_state(env) for name, env in self._parts.envs.items()}
         info = {
             "versions": package_versions(),
             "num_timesteps": self.num_timesteps,
@@ -217,14 +255,16 @@ class TrainingCheckpoint(BaseCallback):
             "model": describe_model(self.model),
             "callbacks": describe_callbacks(self._parts.callbacks),
             "learn": {name: self.locals[name] for name in ("log_interval", "tb_log_name", "progress_bar")},
-            "log_folder": self.logger.dir,
+            "log": describe_log(self.model),
             "training_checkpoint": {"save_freq": self.save_freq, "keep": self.keep, "exact": self.exact},
             "left_out": left_out,
             "chunks": chunk_names(state),
         }
         if self.logger.dir is not None:
             sync_files(Path(self.logger.dir))  # what comes before the checkpoint is not written again
-        return self._folder.write(info, self.model.save, state)
+        path = self._folder.write(info, self.model.save, state)
+        self._note_progress()
+        return path
 
     def _stop(self) -> None:
         """End the training, as the signal would have."""

@@ -41,6 +41,11 @@ class TaskClock:
         return self._total_steps - self._first_step
 
     @property
+    def is_pinned(self) -> bool:
+        """Whether it stays on one task."""
+        return self._pinned_task is not None
+
+    @property
     def is_over(self) -> bool:
         """Whether the present task's time is over. It never is when the clock is pinned to a task."""
         return self._pinned_task is None and bisect_right(self._ends, self._total_steps) != self.task_id
