@@ -19,7 +19,7 @@ from typing import Any
 import gymnasium as gym
 from rich.console import Console
 
-from benchmarks.grid.attempts import PACKAGES
+from benchmarks.grid.attempts import PACKAGES, newest_checkpoint
 from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs
 from benchmarks.grid.results import find_result, read_result, read_results
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         grid = grid_runs(list(SUITES) if args.suite == "all" else [args.suite], args.env, args.method, args.seeds, args.budget)
         if args.dry_run:
-            list_grid(grid, args.results, console)
+            list_grid(grid, args.results, args.logs, console)
             return 0
         if all(find_result(run, args.results) for run in grid):
             console.print(f"All {len(grid)} runs are done. Results: {args.results}")
@@ -111,10 +111,11 @@ def make_backend(address: str | None, cpus: int | None, gpus_per_run: float) -> 
     return RayBackend(address, gpus_per_run)
 
 
-def list_grid(grid: Sequence[Run], results: Path, console: Console) -> None:
+def list_grid(grid: Sequence[Run], results: Path, logs: Path, console: Console) -> None:
     """
     :param grid: Runs of the grid
     :param results: Folder of all results
+    :param logs: Folder of the logs, with the checkpoints that runs go on from
     :param console: Where they are listed
     """
     rates = Rates(read_results(results)[0])
@@ -125,8 +126,13 @@ def list_grid(grid: Sequence[Run], results: Path, console: Console) -> None:
             n_done += 1
             status = f"done in {duration(done.seconds)}"
         else:
-            seconds_left += rates.seconds(run)
-            status = duration(rates.seconds(run))
+            origin, _ = newest_checkpoint(run, logs)
+            n_steps = 0 if origin is None else origin.num_timesteps
+            seconds = rates.seconds(run) * (1 - n_steps / run.total_steps)
+            seconds_left += seconds
+            status = duration(seconds)
+            if n_steps:
+                status += f"; goes on from step {n_steps:,}".replace(",", " ")
         steps = f"{run.n_tasks} x {run.steps_per_task:,}".replace(",", " ")
         console.print(f"{run.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
     console.print(

@@ -37,8 +37,11 @@ def save_checkpoint(folder, num_timesteps):
     """As `sb3-cchain train` does, with nothing in it."""
     checkpoint = folder / "algo" / "env_1" / "checkpoints" / f"step_{num_timesteps:012d}"
     checkpoint.mkdir(parents=True)
-    info = {"format": 1, "num_timesteps": num_timesteps, "seconds": 100.0, "files": {}, "chunks": [], "versions": {}}
-    (checkpoint / "checkpoint.json").write_text(json.dumps(info))
+    # Which takes longer to import than most of these processes live
+    from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, write_info
+
+    info = {"format": FORMAT, "num_timesteps": num_timesteps, "seconds": 100.0, "files": {}, "chunks": [], "versions": {}}
+    write_info(checkpoint, info)
 
 
 def train():

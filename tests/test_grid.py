@@ -381,12 +381,20 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
     arguments = ["--suite", "gym_control", "--env", "Continual/CartPole-v1", "--method", "vanilla", "cchain"]
     arguments += ["--budget", "smoke", "--results", str(tmp_path)]
     write_result(make_result(tmp_path), ROWS, [])
-    assert main([*arguments, "--dry-run"]) == 0
+    assert main([*arguments, "--dry-run", "--logs", str(tmp_path / "logs")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == "CartPole-v1 vanilla seed 0 2 x 800 steps 4 s".split()
     assert lines[1].split() == "CartPole-v1 cchain seed 0 2 x 800 steps done in 10 s".split()
     assert lines[2].startswith("2 runs, 1 of them done. The other 1 take 4 s on a core")
     assert lines[3].startswith("1 of the results were made with sb3-cchain 0")
+    # A run of which there is a checkpoint: a quarter is left
+    (run,) = grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"], None, "smoke")
+    attempt, _ = new_attempt(run, tmp_path / "logs", None)
+    save_checkpoint(attempt.folder, 1200)
+    assert main([*arguments, "--dry-run", "--logs", str(tmp_path / "logs")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == "CartPole-v1 vanilla seed 0 2 x 800 steps 1 s; goes on from step 1 200".split()
+    assert lines[2].startswith("2 runs, 1 of them done. The other 1 take 1 s on a core")
     # Nothing to do needs no Ray
     write_result(make_result(tmp_path, replace(RUN, method="vanilla")), ROWS, [])
     assert main(arguments) == 0

@@ -92,7 +92,7 @@ def new_attempt(run: Run, logs: Path, git_commit: str | None) -> tuple[Attempt, 
     :return: A new attempt at it, and the checkpoint that it is to go on from, None where there is none
     """
     started = datetime.now(timezone.utc)
-    origin, path = _newest_checkpoint(run, logs)
+    origin, path = newest_checkpoint(run, logs)
     folder = run.path_in(logs) / f"attempt_{started:%Y%m%dT%H%M%S_%f}_{uuid.uuid4().hex[:8]}"
     folder.mkdir(parents=True)
     about = {
@@ -135,8 +135,13 @@ def _attempts(run: Run, logs: Path) -> Iterator[Attempt]:
             yield attempt
 
 
-def _newest_checkpoint(run: Run, logs: Path) -> tuple[Origin | None, Path | None]:
-    """The newest whole checkpoint of all attempts at a run, without those that an attempt could not go on from."""
+def newest_checkpoint(run: Run, logs: Path) -> tuple[Origin | None, Path | None]:
+    """
+    :param run: A run
+    :param logs: Folder of all logs
+    :return: The newest whole checkpoint of all attempts at it, without those that an attempt could not go on from, and its
+        path; None where there is none
+    """
     attempts = list(_attempts(run, logs))
     refused = {(a.origin.attempt, a.origin.checkpoint) for a in attempts if a.is_broken and a.origin is not None}
     found = [(path.name, attempt.folder.name, path, attempt) for attempt in attempts for path in attempt.checkpoints()]
