@@ -1,5 +1,6 @@
 """Files that one process at a time may write."""
 
+import os
 from pathlib import Path
 from typing import TextIO
 from weakref import WeakValueDictionary
@@ -11,6 +12,19 @@ except ImportError:  # Windows: another process that writes the file is not noti
 
 # The files of this process. One that is still open belongs to training that was interrupted
 _open_files: WeakValueDictionary[Path, TextIO] = WeakValueDictionary()
+
+
+def _leave_to_parent() -> None:
+    """In a process that was forked, such as that of an environment: it would hold the locks when its parent has let go."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for file in _open_files.values():
+        # It stays open, but what is still in its buffer is written by the parent alone
+        os.dup2(nowhere, file.fileno())
+    os.close(nowhere)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def open_locked(path: Path, message: str) -> TextIO:

@@ -279,6 +279,16 @@ def test_one_process_at_a_time(path):
     assert in_new_process(write_to, path) == "free"
 
 
+@pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="needs fork")
+def test_processes_of_environments_do_not_hold_the_lock(path):
+    """Those that were made meanwhile, after an error."""
+    folder = CheckpointFolder(path, 2, NEWEST)
+    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
+    folder.close()
+    CheckpointFolder(path, 2, NEWEST).close()
+    env.close()
+
+
 def test_after_an_error_the_same_process_may_train_again(path, tmp_path):
     """In a notebook, say."""
     model = make()
