@@ -19,7 +19,7 @@ import torch as th
 from benchmarks.grid.run import ROOT
 from benchmarks.speed import sbx_ppo
 from benchmarks.speed.cases import CASES
-from benchmarks.speed.checkpoint_cost import checkpoint_table
+from benchmarks.speed.checkpoint_cost import checkpoint_table, share_table
 from benchmarks.speed.memory import memory_table
 from benchmarks.speed.monitor_cost import monitor_table
 from benchmarks.speed.tables import Table, write_tables
@@ -33,6 +33,7 @@ OTHERS: dict[str, Callable[[], Table]] = {
     "memory": memory_table,
     "monitors": monitor_table,
     "checkpoints": checkpoint_table,
+    "checkpoint_share": share_table,
 }
 
 

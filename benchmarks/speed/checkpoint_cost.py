@@ -6,10 +6,12 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecMonitor
 
+from benchmarks.grid.suites import SUITES
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import Table
 from sb3_cchain import CChainDQN, CChainPPO, TrainingCheckpoint
@@ -23,6 +25,7 @@ class TimedCheckpoint(TrainingCheckpoint):
     def __init__(self, save_freq: int, path: Path):
         super().__init__(save_freq, path)
         self.save_seconds: list[float] = []
+        self.save_processor_seconds: list[float] = []
         self.restore_seconds = 0.0
 
     def _on_rollout_start(self) -> None:
@@ -32,9 +35,10 @@ class TimedCheckpoint(TrainingCheckpoint):
             self.restore_seconds = time.perf_counter() - start
 
     def _save(self) -> Path:
-        start = time.perf_counter()
+        start, processor_start = time.perf_counter(), time.process_time()
         path = super()._save()
         self.save_seconds.append(time.perf_counter() - start)
+        self.save_processor_seconds.append(time.process_time() - processor_start)
         return path
 
 
@@ -89,6 +93,54 @@ def checkpoint_table() -> Table:
     )
     header = ["", "checkpoint", "replay buffer", "to save", "to put back"]
     return Table(header, [[name, *measure(make, *times)] for name, make, *times in CASES], note)
+
+
+# Name, what makes the environment and the model, suite of the grid, environment steps of training that are timed
+SHARES: list[tuple[str, Callable[[], BaseAlgorithm], str, int]] = [
+    ("Acrobot", partial(gym_control, "Continual/Acrobot-v1"), "gym_control", 2400),
+    ("Walker", dmc, "dmc", 4096),
+    ("Starpilot", procgen, "procgen", 2048),
+    ("MinAtar, with a full replay buffer", minatar, "minatar", 2000),
+]
+
+
+def share_table() -> Table:
+    """
+    :return: For a run of each suite, the share of its time that it takes to save it as often as the grid does
+    """
+    note = (
+        "Processor time. `steps` are those from one checkpoint to the next, `training` is what they take. A disk that is busy "
+        "makes it longer."
+    )
+    header = ["", "steps", "training", "to save", "share"]
+    return Table(header, [[name, *measure_share(make, suite, steps)] for name, make, suite, steps in SHARES], note)
+
+
+def measure_share(make: Callable[[], BaseAlgorithm], suite: str, n_steps: int) -> list[str]:
+    """
+    :param make: Makes the model with its environment
+    :param suite: Its suite of the grid
+    :param n_steps: Environment steps of training that are timed
+    :return: Environment steps from one checkpoint to the next, seconds to train for them and to save, the share of the latter
+    """
+    save_freq, model = SUITES[suite].checkpoint_freq, make()
+    with TemporaryDirectory() as folder:
+        if isinstance(model, DQN):
+            saving = TimedCheckpoint(save_freq, Path(folder))
+            model.learn(model.buffer_size + save_freq + 1, saving)  # fills the buffer, and does not learn
+            model.learning_starts, saved = 0, saving.save_processor_seconds[-1]
+            start, before = time.process_time(), model.num_timesteps
+            model.learn(n_steps, reset_num_timesteps=False)
+            training = time.process_time() - start
+        else:
+            saving = TimedCheckpoint(n_steps, Path(folder))
+            start, before = time.process_time(), 0
+            model.learn(2 * n_steps + 1, saving)
+            training = time.process_time() - start - sum(saving.save_processor_seconds)
+            saved = saving.save_processor_seconds[-1]
+    training *= save_freq / (model.num_timesteps - before)
+    steps = f"{save_freq:,}".replace(",", " ")
+    return [steps, f"{training:.0f} s", f"{saved:.2f} s", f"{100 * saved / (training + saved):.2f} %"]
 
 
 def measure(make: Callable[[], BaseAlgorithm], save_freq: int, n_saves: int) -> list[str]:
