@@ -324,6 +324,16 @@ def test_several_calls_are_one_training(tmp_path, create, is_one):
     assert names(tmp_path) == [f"step_{number:012d}" for number in (NEWEST, 144)]
 
 
+def test_a_signal_in_the_last_rollout_of_a_call_stops_the_next_one(tmp_path, handlers):
+    model, callback = make(), TrainingCheckpoint(10**6, tmp_path)
+    model.learn(64, [callback, Send((60, signal.SIGTERM))])
+    with pytest.raises(SystemExit):
+        model.learn(64, [callback, Send()], reset_num_timesteps=False)
+    assert names(tmp_path) == [f"step_{64:012d}"]
+    model.learn(STEPS - 64, [callback, Send()], reset_num_timesteps=False)
+    assert model.num_timesteps == STEPS
+
+
 def test_another_training_of_the_same_model_is_refused(tmp_path):
     model = make()
     model.learn(64, TrainingCheckpoint(32, tmp_path))

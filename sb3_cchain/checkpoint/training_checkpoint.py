@@ -35,6 +35,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class _Progress(NamedTuple):
     last_saved: int
     seconds: float
+    stop_signal: int | None
 
 
 # How far each model has come that this process trains, by the folders of checkpoints
@@ -49,8 +50,8 @@ class TrainingCheckpoint(BaseCallback):
     It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were
     made, and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it
     ends the training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and
-    learned from before that. A second signal ends the training at once. In the last rollout of a training, the first signal
-    changes nothing: training is complete then.
+    learned from before that. A second signal ends the training at once. In the last rollout, the first signal changes nothing:
+    ``learn()`` is complete then. A further call that goes on with the training stops at its start.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
     the same rhythm. It waits for ``save_freq`` steps at the most, and not at all when it is told to stop.
@@ -174,7 +175,8 @@ class TrainingCheckpoint(BaseCallback):
         if earlier is None:
             self._last_saved, self._seconds_before = self.num_timesteps, 0.0
             return None
-        self._last_saved, self._seconds_before = earlier
+        # A signal in the last rollout of the call before stops this one
+        self._last_saved, self._seconds_before, self._stop_signal = earlier
         return self.num_timesteps
 
     def _go_on(self, checkpoint: Checkpoint) -> int | None:
@@ -192,7 +194,8 @@ class TrainingCheckpoint(BaseCallback):
         return checkpoint.num_timesteps if checkpoint.folder.resolve() == self.path.resolve() else None
 
     def _note_progress(self) -> None:
-        _progress.setdefault(self.model, {})[self.path.resolve()] = _Progress(self._last_saved, self.seconds)
+        progress = _Progress(self._last_saved, self.seconds, self._stop_signal)
+        _progress.setdefault(self.model, {})[self.path.resolve()] = progress
 
     def _prepare(self, name: str, env: VecEnv) -> None:
         try:
@@ -225,7 +228,7 @@ class TrainingCheckpoint(BaseCallback):
 
     def _on_training_end(self) -> None:
         if self._stop_signal is not None:
-            print("That was the last rollout: training is complete, and goes on to what comes after it", flush=True)
+            print("That was the last rollout: learn() is complete. A call that goes on with it stops at its start", flush=True)
         self._note_progress()
         self._release()
 
@@ -280,7 +283,9 @@ class TrainingCheckpoint(BaseCallback):
             )
         else:
             print(f"{stopped} and saved to {saved}. {self.advice}", flush=True)
-        if self._stop_signal == signal.SIGTERM:
+        number, self._stop_signal = self._stop_signal, None
+        self._note_progress()
+        if number == signal.SIGTERM:
             sys.exit(128 + signal.SIGTERM)
         raise KeyboardInterrupt
 
