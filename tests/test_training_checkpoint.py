@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_cchain import CChainCallback, ChurnMonitor, TrainingCheckpoint, resume
+from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TrainingCheckpoint, resume
 from sb3_cchain.checkpoint import ResumableEnv, find_checkpoint, load_model
 from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
 from sb3_cchain.envs import TaskVecNormalize
@@ -207,14 +208,19 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path, monkeypatch, handlers):
     assert_same(resume(tmp_path, make_env(), device="cpu"), make().learn(STEPS))
 
 
-def test_the_log_goes_on_in_its_folder(tmp_path):
+@pytest.mark.parametrize("algorithm", [PPO, CChainPPO])
+def test_the_log_goes_on_in_its_folder(tmp_path, algorithm):
     pytest.importorskip("tensorboard")
-    model = make(tensorboard_log=str(tmp_path / "logs"))
+    model = algorithm("MlpPolicy", make_env(), tensorboard_log=str(tmp_path / "logs"), **ARGUMENTS)
     train(model, tmp_path / "checkpoints")
-    resumed = go_on(tmp_path / "checkpoints")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        resumed = go_on(tmp_path / "checkpoints")
+    assert not [warning for warning in caught if "logged" in str(warning.message)]
     assert resumed.logger.dir == model.logger.dir
-    assert [folder.name for folder in (tmp_path / "logs").iterdir()] == ["PPO_1"]
-    assert len(list((tmp_path / "logs" / "PPO_1").iterdir())) == 2
+    name = f"{algorithm.__name__}_1"
+    assert [folder.name for folder in (tmp_path / "logs").iterdir()] == [name]
+    assert len([file for file in (tmp_path / "logs" / name).iterdir() if file.name.startswith("events")]) == 2
 
 
 def test_other_logs_go_on_in_new_files(tmp_path):

@@ -28,10 +28,10 @@ def describe_log(model: BaseAlgorithm) -> dict[str, Any]:
     formats, others = [], []
     for output in model.logger.output_formats:
         name = _format(output)
-        if name is None:
-            others.append(type(output).__name__)
-        else:
+        if name is not None:
             formats.append(name)
+        elif not type(output).__module__.startswith("sb3_cchain."):  # these come by themselves
+            others.append(type(output).__name__)
     has_folder = model._custom_logger or model.tensorboard_log is not None
     return {"folder": model.logger.dir if has_folder else None, "formats": formats, "others": others}
 

@@ -15,9 +15,10 @@ from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.tasks.signal import is_continual
 
 
-def lasting_state(env: VecEnv) -> dict[str, Any]:
+def lasting_state(env: VecEnv, left_out: list[str]) -> dict[str, Any]:
     """
     :param env: A vectorised environment
+    :param left_out: Takes the names of attributes of wrappers that cannot be saved
     :return: What lasts longer than its episodes: the state of its vectorised wrappers, such as the statistics of
         ``VecNormalize``, and how far its tasks are. None of an environment that stays on a task
     """
@@ -26,7 +27,7 @@ def lasting_state(env: VecEnv) -> dict[str, Any]:
     skip = {name: ("venv", "class_attributes", "t_start") for name in wrappers}
     clocks = env.get_attr("clock") if is_continual(env) else []
     return {
-        "wrappers": object_states(wrappers, _known(env), skip=skip),
+        "wrappers": object_states(wrappers, _known(env), skip=skip, left_out=left_out),
         "task_steps": [None if clock.is_pinned else clock.n_steps for clock in clocks],
     }
 

@@ -247,7 +247,7 @@ class TrainingCheckpoint(BaseCallback):
         self._last_saved = self.num_timesteps
         state, left_out = training_state(self._parts, self._folder.store, with_envs=self.exact)
         if not self.exact:
-            state["lasting"] = {name: lasting_state(env) for name, env in self._parts.envs.items()}
+            state["lasting"] = {name: lasting_state(env, left_out) for name, env in self._parts.envs.items()}
         info = {
             "versions": package_versions(),
             "num_timesteps": self.num_timesteps,
