@@ -20,8 +20,8 @@ from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.callbacks import ContinualMetrics
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, resume
 from sb3_cchain.envs import ContinualEnv, register_envs
-from sb3_cchain.networks import make_lean
-from sb3_cchain.tasks import TaskSync
+from sb3_cchain.networks import make_lean, transfer
+from sb3_cchain.tasks import TaskSignal, TaskSync, task_switched
 from sb3_cchain.tensorboard import TensorBoardOverview
 
 __version__ = "0.1.0"
@@ -39,11 +39,14 @@ __all__ = [
     "DoubleDQN",
     "FiniteCheck",
     "ResumableEnv",
+    "TaskSignal",
     "TaskSync",
     "TensorBoardOverview",
     "TrainingCheckpoint",
     "make_lean",
     "resume",
+    "task_switched",
+    "transfer",
 ]
 
 # Of sb3-contrib, which need not be installed: imported when they are asked for

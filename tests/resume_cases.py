@@ -32,7 +32,7 @@ from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.algorithms.churn_targets import churn_kind
-from sb3_cchain.analysis import NetworkHealth, NTKCallback
+from sb3_cchain.analysis import EvalAllTasks, NetworkHealth, NTKCallback
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, find_checkpoint, resume
 from sb3_cchain.checkpoint.training_description import constructor_arguments
@@ -142,7 +142,11 @@ class Case:
     def make_callbacks(self, folder: Path, save_freq: int, stop: Optional["Stop"]) -> list[BaseCallback]:
         """For ``learn()``."""
         continual = [TaskSync(), ContinualMetrics(folder / "returns.csv")] if self.continual else []
-        others = [*continual, *self.callbacks(), stop or Stop(float("inf"))]
+        own = self.callbacks()
+        for callback in own:
+            if isinstance(callback, EvalAllTasks):
+                callback.path = folder / "task_returns.csv"
+        others = [*continual, *own, stop or Stop(float("inf"))]
         checkpoint = TrainingCheckpoint(save_freq, folder / "checkpoints")
         return [*others, checkpoint] if self.checkpoint_last else [checkpoint, *others]
 
@@ -225,7 +229,10 @@ CASES = {
     # Continual environments
     "CChainPPO acrobot": Case(
         *(CChainPPO, vec_env("Continual/Acrobot-v1", **ACROBOT), {**ON_POLICY, **CHURN, "churn_reference": "next"}),
-        callbacks=lambda: [ChurnMonitor(interval=1), *continual_evaluation("Continual/Acrobot-v1", **ACROBOT)],
+        callbacks=lambda: [
+            *(ChurnMonitor(interval=1), EvalAllTasks(n_eval_episodes=1, interval=60)),
+            *continual_evaluation("Continual/Acrobot-v1", **ACROBOT),
+        ],
         checkpoint_last=True,
         continual=True,
     ),
@@ -244,6 +251,12 @@ CASES = {
     "CChainPPO lander": Case(
         *(CChainPPO, vec_env("Continual/LunarLander-v3", wrap=TaskVecNormalize, **LANDER), {**ON_POLICY, **CHURN}),
         callbacks=lambda: [ChurnMonitor(interval=2)],
+        continual=True,
+        package="Box2D",
+    ),
+    "PPO lander drifting in cycles": Case(
+        *(PPO, vec_env("Continual/LunarLander-v3", **{**LANDER, "n_tasks": 2, "cycles": 2, "blend_steps": 120}), ON_POLICY),
+        callbacks=lambda: [EvalAllTasks(n_eval_episodes=1)],
         continual=True,
         package="Box2D",
     ),
@@ -292,6 +305,22 @@ CASES = {
         continual=True,
         total=160,
         package="dm_control",
+    ),
+    "PPO slippery ant drifting": Case(
+        *(PPO, vec_env("Continual/SlipperyAnt-v0", 1, n_tasks=3, steps_per_task=70, blend_steps=40, max_episode_steps=25)),
+        ON_POLICY,
+        continual=True,
+        total=160,
+        package="mujoco",
+    ),
+    "DQN minigrid processes": Case(
+        *(DQN, vec_env("Continual/MiniGrid-v0", 2, subproc=True, steps_per_task=100)),
+        dict(OFF_POLICY, train_freq=2),
+        continual=True,
+        package="minigrid",
+    ),
+    "PPO sequence": Case(
+        *(PPO, vec_env("Continual/Sequence-v0", steps_per_task=100, cycles=2), ON_POLICY), continual=True, total=400
     ),
     # The algorithms of Stable-Baselines3 and sb3-contrib
     # After a signal, which does not wait for the end of an interval, the log goes on in another rhythm
@@ -429,6 +458,7 @@ def flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
 ATTRIBUTES = (
     *("num_timesteps", "_n_updates", "_episode_num", "_last_obs", "_last_episode_starts", "_last_original_obs"),
     *("exploration_rate", "_total_timesteps", "_current_progress_remaining", "_n_calls", "continual_returns"),
+    "task_returns",
     *("learning_starts", "_last_lstm_states", "churn_state", "continual_state"),
 )
 

@@ -16,6 +16,7 @@ SLOW = (
         "shimmy",
         "gymnasium.envs.classic_control",
     ),
+    *("gymnasium.envs.mujoco.ant_v5", "minigrid", "cv2", "sb3_cchain.envs.minigrid"),
     *("gymnasium.envs.box2d", "sb3_cchain.envs.minatar", "sb3_cchain.envs.dm_control", "sb3_cchain.envs.procgen"),
 )
 for name in SLOW:

@@ -6,6 +6,7 @@ steps. Python snippets of a page run in order and share their names; a test amon
 """
 
 import argparse
+import json
 import re
 import runpy
 import shlex
@@ -90,6 +91,27 @@ def test_python_runs(page, short_rollouts, monkeypatch):
         exec(compile(shorten(code), name_of(page), "exec"), names)
     for name in [name for name in names if name.startswith("test_")]:
         names[name]()
+
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_notebook_runs(notebook, short_rollouts, monkeypatch):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    monkeypatch.setattr(plt, "show", lambda: None)
+    names: dict = {}
+    for cell in json.loads(notebook.read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile(shorten("".join(cell["source"])), name_of(notebook), "exec"), names)
+    plt.close("all")
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_notebook_was_run_as_a_whole(notebook):
+    cells = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert not any(output["output_type"] == "error" for cell in cells for output in cell["outputs"])
 
 
 def test_the_readme_goes_on_where_the_model_was(short_rollouts):

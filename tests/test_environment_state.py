@@ -28,14 +28,16 @@ from stable_baselines3.common.vec_env import (
 from sb3_cchain import ContinualEnv
 from sb3_cchain.checkpoint.environment_state import (
     can_save_environment,
-    environment_state,
+    check_same_environment,
     prepare_environment,
-    restore_environment,
+    remote_states,
+    restore_remotes,
+    vec_env_parts,
 )
 from sb3_cchain.checkpoint.episode_replay import EpisodeReplay
-from sb3_cchain.checkpoint.object_state import object_state, restore_object
+from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
-from sb3_cchain.checkpoint.simulator_state import register_simulators
+from sb3_cchain.checkpoint.simulator_state import emptied, register_simulators
 from sb3_cchain.checkpoint.training_description import describe_env
 from sb3_cchain.envs import ContinualProcgenVecEnv, TaskVecNormalize
 from tests.envs import CountEnv, RandomEnv
@@ -67,6 +69,23 @@ CASES = {
 }
 # In the environments' own processes; the others have nothing there that these do not have
 SUBPROC = ("CartPole-v1", "LunarLander-v3", "HalfCheetah-v5", "Continual/LunarLander-v3", "Continual/Walker-v0")
+
+
+def environment_state(env):
+    """As a checkpoint has it, together with the state of the model and of callbacks."""
+    parts = vec_env_parts(env)
+    with emptied(parts.unused):
+        states = object_states(parts.holders, parts.known, skip=parts.skip, strict=parts.strict)
+    return env.num_envs, states, remote_states(env)
+
+
+def restore_environment(env, state):
+    n_envs, states, remote = state
+    prepare_environment(env)
+    parts = vec_env_parts(env)
+    check_same_environment(env, parts.holders, n_envs, states.holders)
+    restore_objects(parts.holders, states, parts.known)
+    restore_remotes(env, remote)
 
 
 def make(env_id, subproc=False, seed=0):
@@ -277,7 +296,7 @@ def test_mujoco_with_another_model():
     register_simulators()
     hopper, cheetah = (gym.make(name).unwrapped.model for name in ("Hopper-v5", "HalfCheetah-v5"))
     with pytest.raises(ValueError, match="The MuJoCo model differs from the saved one in"):
-        restore_object(cheetah, object_state(hopper))
+        restore_objects({"model": cheetah}, object_states({"model": hopper}))
 
 
 def test_a_recorded_episode_must_have_begun_under_record():
@@ -352,7 +371,7 @@ def test_an_environment_that_cannot_be_saved_is_played_again(wrapper):
 def test_an_environment_that_is_not_deterministic():
     env, new = (begin(DummyVecEnv([Chaotic])) for _ in range(2))
     play(env, range(3))
-    with pytest.raises(ValueError, match=r"Environment 0: .*Chaotic.* 3 steps went otherwise .* not deterministic"):
+    with pytest.raises(ValueError, match=r"environment 0, 0 \w+: .*Chaotic.* 3 steps went otherwise .* not deterministic"):
         restore_environment(new, environment_state(env))
 
 
@@ -418,7 +437,7 @@ def test_transposed_images_keep_their_layout(n_channels):
     # Otherwise convolutions round otherwise
     images = np.arange(2 * 4 * 5 * n_channels, dtype=np.uint8).reshape(2, 4, 5, n_channels)
     saved, new = SimpleNamespace(images=images.transpose(0, 3, 1, 2)), SimpleNamespace()
-    restore_object(new, object_state(saved))
+    restore_objects({"it": new}, object_states({"it": saved}))
     assert new.images.strides == saved.images.strides and (new.images == saved.images).all()
 
 
@@ -439,8 +458,11 @@ def test_another_environment():
     for env, message in [
         (make_vec_env("CartPole-v1", n_envs=3), "There must be 2 environments side by side, .* got 3"),
         (VecNormalize(make_vec_env("CartPole-v1", n_envs=2)), "'0 VecNormalize' instead of '0 DummyVecEnv'"),
-        (make_vec_env("Acrobot-v1", n_envs=2), "Environment 0: .* '4 AcrobotEnv' instead of '4 CartPoleEnv'"),
-        (DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2), "Environment 0: .* '0 TimeLimit' instead of '0 Monitor'"),
+        (make_vec_env("Acrobot-v1", n_envs=2), "'environment 0, 4 AcrobotEnv' instead of 'environment 0, 4 CartPoleEnv'"),
+        (
+            DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2),
+            "'environment 0, 0 TimeLimit' instead of 'environment 0, 0 Monitor'",
+        ),
     ]:
         env.reset()
         with pytest.raises(ValueError, match=message):
@@ -517,10 +539,19 @@ class SharedWorldEnv(gym.Env):
         self.world = World()
         self.players = [self.world]
 
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
 
-def test_refuses_objects_that_would_be_several():
-    with pytest.raises(ValueError, match=r"SharedWorldEnv.*players.*another attribute refers to.*`state_dict\(\)`"):
-        prepare_environment(DummyVecEnv([SharedWorldEnv]))
+    def step(self, action):
+        self.players[0].position += action
+        return np.array([self.world.position], np.float32), 0.0, False, False, {}
+
+
+def test_an_object_that_is_reached_by_two_ways_stays_one():
+    env, new = (begin(DummyVecEnv([SharedWorldEnv])) for _ in range(2))
+    check_cuts(env, new, (3, 20), 40)
+    assert "EpisodeReplay" not in str(env.envs[0])
 
 
 def test_rl_zoos_time_limit_is_gymnasiums():

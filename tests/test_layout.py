@@ -22,8 +22,8 @@ LEVEL = {package: level for level, row in enumerate(ROWS) for package in row}
 # Packages that only an extra installs, and the modules that may import them when they are imported themselves
 EXTRAS = {
     *("matplotlib", "seaborn", "pandas", "rliable", "scipy"),
-    *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "yaml", "ray"),
-    *("procgen", "gym3", "gym", "minatar", "shimmy", "dm_control", "dm_env", "mujoco", "Box2D"),
+    *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "yaml", "ray", "river"),
+    *("procgen", "gym3", "gym", "minatar", "minigrid", "ale_py", "cv2", "shimmy", "dm_control", "dm_env", "mujoco", "Box2D"),
 }
 MODULES_OF_EXTRAS = ("sb3_cchain.zoo", "sb3_cchain.algorithms.contrib", "benchmarks")
 

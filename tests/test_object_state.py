@@ -13,13 +13,9 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_cchain.checkpoint.object_state import (
-    Known,
     NotSaved,
-    object_state,
     object_states,
-    register_copy,
     register_state,
-    restore_object,
     restore_objects,
 )
 
@@ -52,9 +48,13 @@ class Foreign:
 Foreign.__module__ = "elsewhere"
 
 
-def saved(holder, *args, **kwargs):
+def saved(holder, known=None, skip=(), strict=False):
     """As it would be read from a file."""
-    return pickle.loads(pickle.dumps(object_state(holder, *args, **kwargs)))
+    return pickle.loads(pickle.dumps(object_states({"": holder}, known, skip={"": skip}, strict=[""] if strict else [])))
+
+
+def restore_object(holder, state, known=None):
+    restore_objects({"": holder}, state, known)
 
 
 def test_plain_data():
@@ -81,7 +81,7 @@ def test_plain_data():
 
 def test_a_state_does_not_change_any_more():
     thing = Thing(array=np.zeros(2), tensor=th.zeros(2), list=[1])
-    state = object_state(thing)
+    state = saved(thing)
     thing.array += 1
     thing.tensor += 1
     thing.list.append(2)
@@ -126,6 +126,96 @@ def test_what_two_attributes_share_is_shared_afterwards():
     assert live.second[0] == 5
 
 
+class World:
+    """Moves when it is told to."""
+
+    def __init__(self, position):
+        self.position = position
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_what_a_container_and_an_attribute_share_is_shared_afterwards(strict):
+    def make(value, *, attribute_first):
+        world, plain, tensor = World(value), [value], th.tensor([value])
+        attributes = dict(world=world, plain=plain, tensor=tensor)
+        containers = dict(worlds=[world], plains={"deep": [plain]}, tensors=(tensor,), again=[[plain], world])
+        return Thing(**(attributes | containers if attribute_first else containers | attributes))
+
+    for attribute_first in (True, False):
+        live = make(0, attribute_first=attribute_first)
+        world = live.world
+        restore_object(live, saved(make(7, attribute_first=attribute_first), strict=strict))
+        assert live.world is world and live.worlds[0] is live.again[1] is world and world.position == 7
+        assert live.plains["deep"][0] is live.again[0][0] is live.plain and live.plain == [7]
+        assert live.tensors[0] is live.tensor and live.tensor.tolist() == [7]
+
+
+@pytest.mark.parametrize("cut", [lambda grid: grid[1], lambda grid: grid[::-1, 1::2], lambda grid: grid.T])
+@pytest.mark.parametrize("base", [np.zeros((3, 4)), np.zeros(12).reshape(3, 4)], ids=["own memory", "view"])
+def test_a_view_of_an_array_stays_a_view(cut, base):
+    def make(value):
+        grid = base.copy() if base.base is None else base.base.copy().reshape(base.shape)
+        grid += np.arange(12).reshape(3, 4) + value
+        return Thing(part=cut(grid), grid=grid)
+
+    source, live = make(5), make(0)
+    restore_object(live, saved(source))
+    assert np.array_equal(live.part, source.part) and np.array_equal(live.grid, source.grid)
+    live.grid[:] = 9
+    assert (live.part == 9).all() and live.part.strides == source.part.strides
+
+
+def walk(thing):
+    """A behaviour."""
+
+
+class Animal(Thing):
+    def run(self):
+        pass
+
+    def rest(self):
+        pass
+
+
+def test_behaviours():
+    """Functions and methods by which an environment keeps what it does."""
+    source, live = Animal(value=1), Animal(value=0)
+    source.now, source.then, source.made = source.run, walk, lambda: 1
+    live.now, live.then, live.made = live.rest, print, (made := lambda: 2)
+    restore_object(live, saved(source, strict=True))
+    assert live.now == live.run and live.made is made
+    # A function of another kind is not replaced
+    assert live.then is print
+
+
+def test_a_method_that_was_replaced_is_not_mistaken_for_its_replacement():
+    source, live = Animal(value=1), Animal(value=0)
+    for thing in (source, live):
+        thing.original = thing.run
+        thing.run = lambda: None
+    original = live.original
+    restore_object(live, saved(source, strict=True))
+    assert live.original == original
+
+
+@pytest.mark.parametrize("make", [lambda value: Thing(value=value), lambda value: [value]], ids=["object", "list"])
+def test_what_is_shared_in_this_process_alone_is_not_shared_afterwards(make):
+    live = Thing(first=make(0))
+    live.second = live.first
+    restore_object(live, saved(Thing(first=make(1), second=make(2))))
+    first, second = (vars(it) if isinstance(it, Thing) else it for it in (live.first, live.second))
+    assert first == ({"value": 1} if isinstance(first, dict) else [1]) and first != second
+
+
+@pytest.mark.parametrize("make", [lambda it: [it], lambda it: {it: it}, lambda it: {it}], ids=["list", "dict", "set"])
+def test_containers_stay_the_objects_that_they_are(make):
+    """So somebody who was given one in this process has the right one."""
+    live = Thing(inside=make(0))
+    given = live.inside
+    restore_object(live, saved(Thing(inside=make(1))))
+    assert live.inside is given and given == make(1)
+
+
 def test_what_two_holders_share_is_shared_afterwards():
     def make(value):
         shared = {"task": value}
@@ -165,7 +255,6 @@ def test_cycles():
 def test_known_objects_are_those_of_this_process():
     model, other = Thing(value=1), Thing(value=2)
     state = saved(Thing(model=model, among=[model, {"it": model}]), {"model": model})
-    assert state.values["model"] == Known("model")
     live = Thing(model=None, among=None)
     restore_object(live, state, {"model": other})
     assert live.model is other and live.among[0] is other and live.among[1]["it"] is other and other.value == 2
@@ -193,7 +282,7 @@ def test_one_generator_of_two():
 
 def test_tensors_keep_no_more_than_they_show():
     big = th.zeros(10_000)
-    state = object_state(Thing(view=big[:2]))
+    state = saved(Thing(view=big[:2]))
     assert len(pickle.dumps(state)) < 2000
     live = Thing(view=None)
     restore_object(live, state)
@@ -253,16 +342,6 @@ def test_types_whose_state_is_registered():
     assert live.closed is closed and closed.value == 5
 
 
-def test_types_whose_copying_is_registered():
-    register_copy(Foreign, lambda old, new: vars(old).update(vars(new)))
-    sys.modules.setdefault("elsewhere", sys.modules[__name__])
-    live, source = Thing(foreign=Foreign()), Thing(foreign=Foreign())
-    source.foreign.value = 5
-    foreign = live.foreign
-    restore_object(live, saved(source))
-    assert live.foreign is foreign and foreign.value == 5
-
-
 class Other:
     """Of another package, and no more than attributes."""
 
@@ -291,11 +370,14 @@ def test_all_is_saved_where_it_has_to_be():
 
 
 def test_what_cannot_be_saved_is_named():
+    holders = {"env": Thing(inner=Thing(lock=threading.Lock(), number=1))}
     with pytest.raises(NotSaved, match=r"^env\.inner\.lock: cannot pickle"):
-        object_states({"env": Thing(inner=Thing(lock=threading.Lock()))}, strict=True)
+        object_states(holders, strict=["env"])
     left_out = []
-    states = object_states({"env": Thing(inner=Thing(lock=threading.Lock()))}, left_out=left_out)
-    assert left_out == ["env.inner.lock"] and states["env"].values["inner"].values == {}
+    states = object_states(holders, left_out=left_out)
+    live = {"env": Thing(inner=Thing(lock="mine", number=0))}
+    restore_objects(live, states)
+    assert left_out == ["env.inner.lock"] and vars(live["env"].inner) == {"lock": "mine", "number": 1}
 
 
 def test_what_belongs_to_the_process_stays(tmp_path):

@@ -13,6 +13,7 @@ from benchmarks.grid.run import ROOT, Run, as_json, paper_methods, shipped_hyper
 from benchmarks.grid.suites import SUITES, paper_length
 from benchmarks.report.__main__ import main
 from benchmarks.report.cells import make_cells
+from benchmarks.report.continual_table import continual_table
 from benchmarks.report.document import write_report
 from benchmarks.report.estimates import (
     agrees,
@@ -294,6 +295,34 @@ def test_table_of_tasks_by_hand(tmp_path):
         ["PPO", "1", "-1.0", "–", "–"],
         ["C-CHAIN PPO", "0", "-15.0", "-40.0", "-27.5"],
     ]
+
+
+def test_table_of_plasticity_by_hand(tmp_path):
+    # The Oracle's curve in the second task: 10 until step 110, a line to 20 at 120, then level: 0.1 of 10, of 15, 0.8 of 20
+    write(tmp_path, "oracle", [[10.0, 10.0], [10.0, 20.0]])
+    write(tmp_path, "vanilla", [[10.0, 12.0], [5.0, 5.0]], metrics=[(100, "continual_eval/forgetting", 9.0)])
+    write(tmp_path, "vanilla", [[10.0, 8.0], [5.0, 15.0]], seed=1)
+    write(tmp_path, "cchain", [[10.0, 10.0], [20.0, 30.0]], metrics=[(200, "continual_eval/forgetting", 1.0)])
+    runs = whole_results(tmp_path)
+    header, _, *rows = table_rows(continual_table(runs, GYM_LINES, 1, own_scales=False))
+    cells = {row[0]: dict(zip(header[1:], row[1:], strict=True)) for row in rows}
+    oracle, vanilla, cchain = (cells[GYM_LINES[name].label] for name in ("oracle", "vanilla", "cchain"))
+    assert vanilla["seeds"] == "0 1" and vanilla["forgetting"] == "9.0" and cchain["forgetting"] == "1.0"
+    assert (vanilla["gap, first task"], vanilla["gap, last task"]) == ("0.0", "7.5")
+    assert (cchain["gap, first task"], cchain["gap, last task"]) == ("0.0", "-10.0")
+    # The best is 30. Vanilla's areas are 5 and 0.1 of 5, 0.1 of 10, 0.8 of 15; C-CHAIN's 0.1 of 20, of 25, of 30
+    assert vanilla["forward transfer"] == f"{((5 + 13.5) / 2 - 18.5) / 11.5:.2f}"
+    assert cchain["forward transfer"] == f"{(28.5 - 18.5) / 11.5:.2f}"
+    # To 11, never; to 9, by the second rollout, 100 steps after the last of the task before
+    assert (vanilla["recovered"], vanilla["steps to recover"]) == ("1 of 2", "100")
+    assert (cchain["recovered"], cchain["steps to recover"]) == ("1 of 1", "90")
+    assert (oracle["gap, last task"], oracle["forward transfer"], oracle["recovered"]) == ("–", "–", "1 of 1")
+
+
+def test_table_of_plasticity_without_its_data(tmp_path):
+    write(tmp_path, "vanilla", [[10.0, 12.0], [5.0, 5.0]])
+    header, _, row = table_rows(continual_table(whole_results(tmp_path), GYM_LINES, 1, own_scales=True))
+    assert row[2:] == ["–"] * 5 and "forgetting" not in header
 
 
 def test_aggregate_of_complete_methods_by_hand(tmp_path):

@@ -142,6 +142,77 @@ def test_the_model_is_one_of_stable_baselines3(trained):
     model.learn(32)
 
 
+class LevelEnv(gym.Wrapper):
+    """Rewards by the level that somebody else decides on, in a list that both have."""
+
+    def __init__(self, levels):
+        super().__init__(gym.make("CartPole-v1"))
+        self.levels = levels
+
+    def step(self, action):
+        observation, _, *rest = self.env.step(action)
+        return observation, float(self.levels[-1]), *rest
+
+
+class Curriculum(BaseCallback):
+    def __init__(self, given):
+        super().__init__()
+        self.levels = given
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.levels.append(self.levels[-1] + 1)
+
+
+class ArgumentCurriculum(Curriculum):
+    """The attribute is named like the argument, so it stays the list of the present process."""
+
+    def __init__(self, levels):
+        super().__init__(levels)
+
+
+@pytest.mark.parametrize("kind", [Curriculum, ArgumentCurriculum])
+def test_what_a_callback_and_an_environment_share_stays_shared(tmp_path, kind):
+    def setup():
+        levels = [0]
+        return make_vec_env(lambda: LevelEnv(levels), seed=0), kind(levels)
+
+    env, curriculum = setup()
+    expected = make(env)
+    expected.learn(STEPS, curriculum)
+    env, curriculum = setup()
+    train(make(env), tmp_path, curriculum)
+    env, curriculum = setup()
+    assert_same(expected, go_on(tmp_path, curriculum, env=env))
+    assert curriculum.levels == list(range(11))
+
+
+class Decay(BaseCallback):
+    """Changes an attribute that is named like an argument, and keeps the other one."""
+
+    def __init__(self, rate, log_path):
+        super().__init__()
+        self.rate, self.log_path = rate, log_path
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.rate /= 2
+        self.model.ent_coef = self.rate
+
+
+def test_arguments_that_a_callback_changes_go_on(tmp_path):
+    expected = make()
+    expected.learn(STEPS, Decay(1.0, "first"))
+    train(make(), tmp_path, Decay(1.0, "first"))
+    callback = Decay(1.0, "second")
+    assert_same(expected, go_on(tmp_path, callback))
+    assert callback.rate == 2.0**-10 and callback.log_path == "second"
+
+
 def test_training_with_it_is_training_without_it(tmp_path):
     for create in (make, make_dqn):
         models = []

@@ -11,7 +11,7 @@ from stable_baselines3 import DQN, PPO
 
 from benchmarks.grid.run import suite_methods
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from sb3_cchain.envs.registration import CONTINUAL_ENVS, OTHER_ENVS
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
 from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, command, shipped_settings
@@ -20,6 +20,9 @@ from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PR
 NEW_ALGOS = ["ppo_cchain", "dqn_cchain", "double_dqn"]
 # The related methods that have a YAML file
 METHODS = [row.algo for row in REGISTRY if row.is_related and (hyperparams_folder() / f"{row.algo}.yml").is_file()]
+
+
+OTHER = [f"Continual/{name}" for name in OTHER_ENVS]
 
 
 def train(folder, algo, env_id, n_steps, *arguments):
@@ -43,6 +46,8 @@ def test_every_environment_has_settings():
     for suite, env_ids in ENV_IDS.items():
         for algo in algos_of(suite):
             covered.setdefault(algo, set()).update(env_ids)
+    for algo in ("ppo", "ppo_cchain"):
+        covered[algo].update(OTHER)
     for algo, env_ids in covered.items():
         assert {key for key in shipped_settings(algo) if not key.endswith("default") and "defaults" not in key} == env_ids
     for algo in NEW_ALGOS:
@@ -61,7 +66,7 @@ ROLLOUTS = {
     for suite, env_ids in ENV_IDS.items()
     for env_id in env_ids
     for algo in algos_of(suite)
-}
+} | {("ppo_cchain", env_id): ["n_envs:1", "n_steps:64", "batch_size:32", "n_epochs:1"] for env_id in OTHER}
 
 
 @pytest.mark.parametrize("algo, env_id", ROLLOUTS)
@@ -97,6 +102,8 @@ def test_suites_differ_in_the_churn_arguments_alone():
         assert ppo[env_id]["n_timesteps"] == (4e6 if "Dog" in env_id else 3e6)
     for env_id in PROCGEN:
         assert cchain[env_id] == cchain["Continual/Starpilot-v0"]
+    for env_id in OTHER:
+        assert cchain[env_id] == ppo[env_id]
 
 
 def test_dqn_settings_differ_where_the_algorithms_do():

@@ -19,6 +19,8 @@ from benchmarks.grid.run import (
 )
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cells, make_cells, versions_text
+from benchmarks.report.continual_table import WORDS as CONTINUAL_WORDS
+from benchmarks.report.continual_table import continual_table
 from benchmarks.report.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
 from benchmarks.report.figures import plot_learning_curves, plot_quantities, plot_reliable_metrics
 from benchmarks.report.markdown import code, escaped, markdown_table
@@ -171,6 +173,7 @@ def _suite_section(suite: str, results: Sequence[Result], paper: Table, pictures
     parts += _hyperparameters_section(suite, results, paper)
     parts += _reliable_section(suite, cells, paper, pictures)
     parts += _curves_section(suite, results, paper, pictures)
+    parts += _continual_section(suite, results, paper)
     parts += _ntk_section(suite, results, paper, pictures)
     return "\n\n".join(parts)
 
@@ -325,6 +328,16 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, picture
         plot_learning_curves(runs, path, lines)
         table = markdown_table(returns_header(runs[0].task_names), returns_rows(runs, lines, table_digits(paper)))
         parts += [f"{short_name(env_id)}:", picture, table]
+    return parts
+
+
+def _continual_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:
+    """Plasticity, transfer, recovery and forgetting."""
+    lines = suite_lines(suite, (result.line for result in results))
+    parts = ["### Plasticity, transfer, recovery", CONTINUAL_WORDS]
+    for env_id, runs in _by_env(results, paper).items():
+        table = continual_table(runs, lines, table_digits(paper), SUITES[suite].own_scales)
+        parts += [f"{short_name(env_id)}:", table]
     return parts
 
 

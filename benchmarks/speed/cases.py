@@ -4,9 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import sb3_contrib
 import stable_baselines3
 import torch as th
+from sb3_contrib.common.envs import InvalidActionEnvDiscrete
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
@@ -144,21 +146,20 @@ def family() -> Case:
     """
     :return: Each of the other algorithms with churn reduction and its base, with their default targets and a small network
     """
-    off_policy = dict(learning_starts=100, buffer_size=10_000)
-    settings: dict[str, dict[str, Any]] = {
-        "A2C": {},
-        "TRPO": dict(n_steps=128, batch_size=64),
-        "RecurrentPPO": dict(n_steps=128, batch_size=64, n_epochs=4),
-        "QRDQN": dict(train_freq=1, **off_policy),
-        **{name: off_policy for name in ("SAC", "TD3", "TQC", "CrossQ")},
+    on_policy, off_policy = dict(n_steps=128, batch_size=64), dict(learning_starts=100, buffer_size=10_000)
+    masked = InvalidActionEnvDiscrete(dim=20, n_invalid_actions=10)
+    settings: dict[str, tuple[str, str | gym.Env, dict[str, Any]]] = {
+        "A2C": ("MlpPolicy", "CartPole-v1", {}),
+        "TRPO": ("MlpPolicy", "CartPole-v1", on_policy),
+        "MaskablePPO": ("MlpPolicy", masked, dict(n_epochs=4, **on_policy)),
+        "RecurrentPPO": ("MlpLstmPolicy", "CartPole-v1", dict(n_epochs=4, **on_policy)),
+        "QRDQN": ("MlpPolicy", "CartPole-v1", dict(train_freq=1, **off_policy)),
+        **{name: ("MlpPolicy", "Pendulum-v1", off_policy) for name in ("SAC", "TD3", "DDPG", "TQC", "CrossQ")},
     }
     entries = {}
-    for name, arguments in settings.items():
-        env = "Pendulum-v1" if name in ("SAC", "TD3", "TQC", "CrossQ") else "CartPole-v1"
-        policy = "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
-        for algorithm in (getattr(stable_baselines3, name, None) or getattr(sb3_contrib, name), f"CChain{name}"):
-            if isinstance(algorithm, str):
-                algorithm = getattr(sb3_cchain, algorithm)
+    for name, (policy, env, arguments) in settings.items():
+        base = getattr(stable_baselines3, name, None) or getattr(sb3_contrib, name)
+        for algorithm in (base, getattr(sb3_cchain, f"CChain{name}")):
             model = algorithm(policy, env, policy_kwargs=dict(net_arch=[64, 64]), seed=0, device="cpu", **arguments)
             timed_learn(model, 256, "", continual=False)  # from here on, every update has a churn loss
             entries[algorithm.__name__] = Entry(partial(timed_learn, model, 128, "steps and updates", continual=False))

@@ -1,10 +1,8 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
-import warnings
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
@@ -14,6 +12,7 @@ from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
+from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
@@ -21,7 +20,7 @@ from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
 
 
-class ChurnAlgorithm(BaseAlgorithm):
+class ChurnAlgorithm(ZeroRateWarning):
     """
     Makes an algorithm of SB3 or sb3-contrib reduce churn: ``class CChainSAC(ChurnAlgorithm, SAC)``.
 
@@ -78,7 +77,6 @@ class ChurnAlgorithm(BaseAlgorithm):
         arguments.check()
         arguments.target_names(kind, type(self).__name__)
         self._task_switch = TaskSwitch()
-        self._is_first_training = True
         super().__init__(*args, **kwargs)
 
     @property
@@ -137,22 +135,12 @@ class ChurnAlgorithm(BaseAlgorithm):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
-        self._is_first_training = True
         if callback is None:
             callback = []  # SB3's stand-in for no callback would be called at each step
         elif not isinstance(callback, (BaseCallback, list)):
             callback = ConvertCallback(callback)  # a function
         given = callback if isinstance(callback, list) else [callback]
         return super()._init_callback(with_continual_callbacks([*given, FiniteCheck()], self.env), progress_bar)
-
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        super()._update_learning_rate(optimizers)
-        if self._is_first_training and self.lr_schedule(self._current_progress_remaining) == 0 < self.lr_schedule(1.0):
-            warnings.warn(
-                "The learning rate is 0 from the first update of this `learn()` on, so nothing is learned. SB3's schedules go "
-                "to their end within each `learn()`: train for more than one rollout in a call, or use a constant rate."
-            )
-        self._is_first_training = False
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)

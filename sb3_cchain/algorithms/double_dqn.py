@@ -15,6 +15,7 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional as F
 
 from sb3_cchain.algorithms.q_network import finite_td_loss
+from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.checkpoint import TrainingCheckpoint
 from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
@@ -25,7 +26,7 @@ SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 LOSSES = {"huber": F.smooth_l1_loss, "mse": F.mse_loss}
 
 
-class DoubleDQN(DQN):
+class DoubleDQN(ZeroRateWarning, DQN):
     r"""
     Deep Q-Network with Double Q-learning.
 

@@ -1,15 +1,19 @@
-"""Callbacks for training: the paper's rollouts, how well the agent does over the tasks, and what callbacks share."""
+"""Callbacks for training: the paper's rollouts, schedules, how well the agent does, and what callbacks share."""
 
-from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
+from sb3_cchain.callbacks.continual_metrics import ContinualMetrics, task_averages
 from sb3_cchain.callbacks.episodic_rollouts import EpisodicRollouts
 from sb3_cchain.callbacks.returns_file import read_returns
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
+from sb3_cchain.callbacks.schedules import OverallSchedule, TaskSchedule
 from sb3_cchain.callbacks.task_learning_starts import TaskLearningStarts
 
 __all__ = [
     "ContinualMetrics",
     "EpisodicRollouts",
+    "OverallSchedule",
     "RolloutNormalizedAdvantage",
     "TaskLearningStarts",
+    "TaskSchedule",
     "read_returns",
+    "task_averages",
 ]

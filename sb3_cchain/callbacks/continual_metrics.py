@@ -12,9 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
-from sb3_cchain.tasks.callback_tree import require_single
+from sb3_cchain.tasks.listening import start_listening
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
-from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 
 
@@ -64,8 +63,7 @@ class ContinualMetrics(BaseCallback):
         self._file: ReturnsFile | None = None
 
     def _on_training_start(self) -> None:
-        require_single(self)
-        warn_without_sync(self)
+        start_listening(self, needs_switches=False)
         add_overview(self.model)
         self._finished.clear()
         self._endless.clear()

@@ -1,8 +1,8 @@
-"""The CSV file of the returns of training."""
+"""The CSV files of returns: of training, and of evaluations."""
 
 import csv
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -19,12 +19,14 @@ class ReturnsFile:
     :param path: The file; its folder is made if needed
     :param rows: The rows that it begins with
     :param keep_old: Whether a file that has rows already is kept beside it, as ``<name>.1``, ``<name>.2``, ...
-    :raises ValueError: When the file that is there is not a file of returns, or another process is writing it
+    :param columns: Its columns
+    :raises ValueError: When the file that is there has other columns, or another process is writing it
     """
 
-    def __init__(self, path: Path, rows: Iterable[Mapping[str, float]], keep_old: bool):
+    def __init__(self, path: Path, rows: Iterable[Mapping[str, float]], keep_old: bool, columns: Sequence[str] = COLUMNS):
+        self._columns = columns
         path.parent.mkdir(parents=True, exist_ok=True)
-        has_rows = _check_header(path)
+        has_rows = _check_header(path, columns)
         self._file = _open(path)
         if keep_old and has_rows:
             if os.name != "posix":
@@ -32,14 +34,14 @@ class ReturnsFile:
             os.rename(path, _free_name(path))
             self._file = _open(path)  # closes the old file, whose lock has kept other processes away until now
         self._file.truncate(0)
-        csv.DictWriter(self._file, COLUMNS).writeheader()
+        csv.DictWriter(self._file, columns).writeheader()
         self.append(rows)
 
     def append(self, rows: Iterable[Mapping[str, float]]) -> None:
         """
         :param rows: Rows to write
         """
-        csv.DictWriter(self._file, COLUMNS).writerows(rows)
+        csv.DictWriter(self._file, self._columns).writerows(rows)
         self._file.flush()
 
     def state_dict(self) -> dict[str, str]:
@@ -62,56 +64,55 @@ class ReturnsFile:
         self._file.close()
 
 
-def read_returns(path: str | Path) -> list[dict[str, float]]:
+def read_returns(path: str | Path, columns: Sequence[str] = COLUMNS) -> list[dict[str, float]]:
     """
     :param path: CSV file written by :class:`~sb3_cchain.ContinualMetrics`
+    :param columns: Its columns: integers, and the return as the last
     :return: Its rows
     :raises ValueError: When it is not such a file, or a line of it is damaged
     """
-    _check_header(Path(path))
+    _check_header(Path(path), columns)
     rows = []
     with open(path, newline="") as file:
         for number, line in enumerate(file, start=1):
             if number == 1:
                 continue
             try:
-                timesteps, task_id, n_episodes, mean_return = line.split(",")
-                rows.append(
-                    dict(zip(COLUMNS, (int(timesteps), int(task_id), int(n_episodes), float(mean_return)), strict=True))
-                )
+                *counts, mean_return = line.split(",")
+                rows.append(dict(zip(columns, (*map(int, counts), float(mean_return)), strict=True)))
             except ValueError:
-                raise _damaged(path, number, line) from None
+                raise _damaged(path, number, line, columns) from None
             # A number whose end is missing would be a number, too
             if not line.endswith("\n"):
-                raise _damaged(path, number, line)
+                raise _damaged(path, number, line, columns)
     return rows
 
 
-def _damaged(path: str | Path, number: int, line: str) -> ValueError:
+def _damaged(path: str | Path, number: int, line: str, columns: Sequence[str]) -> ValueError:
     return ValueError(
-        f"{path} is damaged: line {number} must be whole and have the columns {', '.join(COLUMNS)}, got {line!r}. "
+        f"{path} is damaged: line {number} must be whole and have the columns {', '.join(columns)}, got {line!r}. "
         "Delete that line if it is the last, or move the file away."
     )
 
 
-def _check_header(path: Path) -> bool:
-    """Whether there are rows. Raises a ValueError when the file is not empty and not a file of returns."""
+def _check_header(path: Path, columns: Sequence[str]) -> bool:
+    """Whether there are rows. Raises a ValueError when the file is not empty and has other columns."""
     if not path.exists():
         return False
     if path.is_dir():
-        raise ValueError(f"`path` of ContinualMetrics must be a file, but {path} is a folder")
+        raise ValueError(f"`path` of the returns must be a file, but {path} is a folder")
     with open(path, newline="", errors="replace") as file:
         header = file.readline(1000)
-        if header.rstrip("\r\n").split(",") != list(COLUMNS) and header != "":
+        if header.rstrip("\r\n").split(",") != list(columns) and header != "":
             raise ValueError(
-                f"{path} is not a file of returns: its first line must be {','.join(COLUMNS)!r}, got {header!r}. "
-                "Give ContinualMetrics another `path`, or move the file away."
+                f"{path} is not a file of returns: its first line must be {','.join(columns)!r}, got {header!r}. "
+                "Give the callback another `path`, or move the file away."
             )
         return file.readline() != ""
 
 
 def _open(path: Path) -> TextIO:
-    message = f"Another process is writing {path}. Give each training a file of its own: ContinualMetrics(path=...)"
+    message = f"Another process is writing {path}. Give each training a file of its own by the callback's `path`"
     return open_locked(path, message)
 
 

@@ -5,9 +5,8 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cchain.tasks.callback_tree import require_single
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks, step_task
-from sb3_cchain.tasks.sync import warn_without_sync
+from sb3_cchain.tasks.listening import start_listening
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.validation import check_number
 
 
@@ -39,9 +38,7 @@ class TaskLearningStarts(BaseCallback):
             raise TypeError(f"TaskLearningStarts is for off-policy algorithms, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        require_tasks(self)
-        require_single(self)
-        warn_without_sync(self)
+        start_listening(self)
         if self.num_timesteps == 0:
             self.model.learning_starts = self.learning_starts
             self.model.learning_starts_task_id = None  # type: ignore[attr-defined]
@@ -53,9 +50,7 @@ class TaskLearningStarts(BaseCallback):
     def _on_step(self) -> bool:
         if self._switch.task_id is None:
             self._listen(step_task(self.model, self.locals["infos"]))
-        # A switch ends an episode
-        if any(self.locals["dones"].tolist()):
-            self._listen(episode_task(self.model))
+        self._listen(episode_task(self.model))
         return True
 
     def _listen(self, task_id: Any) -> None:

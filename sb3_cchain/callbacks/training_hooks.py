@@ -64,7 +64,7 @@ class TrainingHooks:
 
     def after_call(self, owner: object, method: str, function: Callable[[Any], None]) -> None:
         """
-        :param owner: An object that the model uses, such as its environment
+        :param owner: The model, or an object that it uses, such as its environment
         :param method: Name of one of its methods
         :param function: Called with the result of the method, each time that it has returned
         """
@@ -79,6 +79,10 @@ class TrainingHooks:
             return result
 
         self._attached.enter_context(replaced(owner, method, call))
+        if isinstance(owner, BaseAlgorithm):
+            # SB3 saves all attributes of a model; a saved model must not contain these
+            not_saved = [*owner._excluded_save_params(), method, "_excluded_save_params"]
+            self._attached.enter_context(replaced(owner, "_excluded_save_params", lambda: not_saved))
 
     def _is_over(self) -> bool:
         # SB3 sets the start time at the beginning of each `learn()`

@@ -23,7 +23,7 @@ from sb3_cchain.checkpoint.files import check_path, check_writable, sync_folder,
 from sb3_cchain.locked_file import open_locked
 
 # Of the files. A later version of the package reads it, or says that it does not
-FORMAT = 1
+FORMAT = 2
 INFO, MODEL, STATE = "checkpoint.json", "model.zip", "training.pkl"
 PACKAGES = ("sb3-cchain", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy")
 

@@ -1,22 +1,21 @@
 """The state of vectorised environments, with all that is in them."""
 
-from collections.abc import Mapping
-from copy import deepcopy
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
+import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor, VecVideoRecorder
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from sb3_cchain.checkpoint.object_state import object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import ObjectStates
 from sb3_cchain.checkpoint.resumable_env import (
     RESUMED,
     ResumableEnv,
     attempt,
     can_save_single_environment,
     check_same_layers,
+    environment_parts,
     make_resumable,
-    restore_single_environment,
-    single_environment_state,
 )
 
 # Attributes of vectorised environments that are no state: what they wrap, and what SB3 knows of their class
@@ -63,67 +62,93 @@ def can_save_environment(env: VecEnv) -> bool:
     return True
 
 
-def environment_state(env: VecEnv) -> dict[str, Any]:
+class VecEnvParts(NamedTuple):
+    """
+    The objects of vectorised environments that have state in this process, as ``object_states()`` takes them.
+
+    :param holders: The vectorised environment, its wrappers, and the environments of a ``DummyVecEnv``, by names
+    :param known: What they refer to and is no state of theirs
+    :param skip: Attributes that are no state
+    :param strict: Names of the holders that must be saved whole
+    :param unused: Tasks that do nothing before their next reset
+    """
+
+    holders: dict[str, object]
+    known: dict[str, object]
+    skip: dict[str, Collection[str]]
+    strict: list[str]
+    unused: list[gym.Env]
+
+
+def vec_env_parts(env: VecEnv, prefix: str = "") -> VecEnvParts:
+    """
+    :param env: A prepared environment
+    :param prefix: What names begin with
+    :return: The objects that have state in this process
+    """
+    layers = {f"{prefix}{name}": layer for name, layer in _vec_layers(env).items()}
+    # A monitor counts from its start in its file
+    skip: dict[str, Collection[str]] = {
+        name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()
+    }
+    parts = VecEnvParts(dict(layers), _known(layers), skip, [], [])
+    if isinstance(env.unwrapped, DummyVecEnv):
+        for position, single in enumerate(env.unwrapped.envs):
+            inner = environment_parts(single, f"{prefix}environment {position}, ")
+            parts.holders.update(inner.holders)
+            parts.known.update(inner.known)
+            parts.skip.update(inner.skip)
+            parts.strict.extend(inner.holders)
+            parts.unused.extend(inner.unused)
+    return parts
+
+
+def check_same_environment(env: VecEnv, layers: Iterable[str], n_envs: int, saved_layers: Iterable[str]) -> None:
+    """
+    :param env: A vectorised environment
+    :param layers: Names of its parts that have state in this process
+    :param n_envs: How many environments the saved one consisted of
+    :param saved_layers: Names of the parts of the saved one
+    :raises ValueError: Naming what differs
+    """
+    if env.num_envs != n_envs:
+        raise ValueError(f"There must be {n_envs} environments side by side, as in the checkpoint, got {env.num_envs}")
+    check_same_layers(layers, saved_layers)
+
+
+def remote_states(env: VecEnv) -> list[ObjectStates]:
     """
     :param env: A prepared environment, between two steps
-    :return: Its state, which can be pickled and does not change any more. ``state["left_out"]`` names attributes of vectorised
-        wrappers that are not part of it
+    :return: State of the environments that are in other processes
     :raises ValueError: When the state cannot be saved
     """
-    layers, left_out = _vec_layers(env), list[str]()
-    # A monitor counts from its start in its file
-    skip = {name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()}
-    states = object_states(layers, _known(layers), skip=skip, left_out=left_out)
-    return {
-        "n_envs": env.num_envs,
-        "layers": states,
-        "envs": _single_states(env.unwrapped),
-        "reset_infos": deepcopy(list(env.unwrapped.reset_infos)),
-        "left_out": left_out,
-    }
-
-
-def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
-    """
-    Put a state back.
-
-    :param env: An environment made in the same way as the saved one, after a reset
-    :param state: What :func:`environment_state` returned
-    :raises ValueError: Naming what differs from the saved environment
-    """
-    if env.num_envs != state["n_envs"]:
-        raise ValueError(
-            f"There must be {state['n_envs']} environments side by side, as in the checkpoint, got {env.num_envs}"
-        )
-    layers = _vec_layers(env)
-    check_same_layers(layers, state["layers"])
-    prepare_environment(env)
-    base = env.unwrapped
-    if isinstance(base, SubprocVecEnv):
-        for remote, single in zip(base.remotes, state["envs"], strict=True):
-            remote.send(("env_method", ("attempt_load", (single,), {})))
-        for position, (fault, _) in enumerate([remote.recv() for remote in base.remotes]):
-            _raise(position, fault)
-        for remote, info in zip(base.remotes, state["reset_infos"], strict=True):
-            remote.send(("reset", (None, {RESUMED: info})))
-        for remote in base.remotes:
-            remote.recv()
-    elif isinstance(base, DummyVecEnv):
-        for position, single in enumerate(base.envs):
-            _raise(position, attempt(restore_single_environment, single, state["envs"][position])[0])
-    restore_objects(layers, state["layers"], _known(layers))
-
-
-def _single_states(base: VecEnv) -> list[Any]:
-    if isinstance(base, SubprocVecEnv):
-        results = base.env_method("attempt_state")
-    elif isinstance(base, DummyVecEnv):
-        results = [attempt(single_environment_state, single) for single in base.envs]
-    else:
+    if not isinstance(env.unwrapped, SubprocVecEnv):
         return []
+    results = env.unwrapped.env_method("attempt_state")
     for position, (fault, _) in enumerate(results):
         _raise(position, fault)
     return [state for _, state in results]
+
+
+def restore_remotes(env: VecEnv, states: Sequence[ObjectStates]) -> None:
+    """
+    Put the states of environments in other processes back.
+
+    :param env: An environment made in the same way as the saved one, whose own state in this process has been put back
+    :param states: What :func:`remote_states` returned
+    :raises ValueError: Naming what differs from the saved environment
+    """
+    base = env.unwrapped
+    if not isinstance(base, SubprocVecEnv):
+        return
+    for remote, single in zip(base.remotes, states, strict=True):
+        remote.send(("env_method", ("attempt_load", (single,), {})))
+    for position, (fault, _) in enumerate([remote.recv() for remote in base.remotes]):
+        _raise(position, fault)
+    for remote, info in zip(base.remotes, base.reset_infos, strict=True):
+        remote.send(("reset", (None, {RESUMED: info})))
+    for remote in base.remotes:
+        remote.recv()
 
 
 def _vec_layers(env: VecEnv) -> dict[str, VecEnv]:
@@ -137,9 +162,9 @@ def _vec_layers(env: VecEnv) -> dict[str, VecEnv]:
 
 
 def _known(layers: Mapping[str, VecEnv]) -> dict[str, object]:
-    *_, base = layers.values()
+    *_, (base_name, base) = layers.items()
     # Not the empty tuple, which is one object wherever it stands
-    return {name: value for name in ENVIRONMENTS if (value := vars(base).get(name))}
+    return {f"{base_name} {name}": value for name in ENVIRONMENTS if (value := vars(base).get(name))}
 
 
 def _has_own_state(env: VecEnv) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cchain.checkpoint.object_state import object_states, restore_objects, stock_class
+from sb3_cchain.checkpoint.object_state import ObjectStates, object_states, restore_objects, stock_class
 
 # How environments and wrappers were made
 CONSTRUCTION = frozenset({"_cached_spec", "_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs", "mujoco_renderer"})
@@ -31,7 +31,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         super().__init__(env)
         self.is_recorded = not begun
         # State of the environment before the reset, and the arguments of the reset; None before the first one
-        self._before: dict[str, Any] | None = None
+        self._before: ObjectStates | None = None
         self._reset_arguments: dict[str, Any] = {}
         self._actions: list[Any] = []
         self._observation: Any = None
@@ -107,7 +107,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
                 "`state_dict()` and `load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
             )
 
-    def _attributes(self) -> dict[str, Any]:
+    def _attributes(self) -> ObjectStates:
         layers = self._layers()
         return object_states(layers, self._known(), skip=dict.fromkeys(layers, CONSTRUCTION))
 

@@ -1,8 +1,10 @@
 """
-The state of an object: what its attributes hold, to be put back into one that was made in the same way in another process.
+The state of objects: what their attributes hold, to be put back into objects made in the same way in another process.
 
-Objects stay the objects that they are, and only data is put back. So whoever else refers to them, such as hooks and closures,
-refers to the right one afterwards, and what cannot be saved, such as an open file, is that of the new process.
+Objects, lists, dicts and sets that attributes refer to stay the objects that they are, and only their content is put back. So
+whoever else refers to them, such as hooks and closures, refers to the right one afterwards, and what cannot be saved, such as
+an open file, is that of the new process. All contents are pickled at once, so that what several of them refer to is still one
+object afterwards.
 
 An object that knows better what its state is has the methods ``state_dict()`` and ``load_state_dict(state)``, as PyTorch's
 modules and optimisers have. Its attributes are not looked at then.
@@ -13,6 +15,7 @@ import io
 import math
 import pickle
 import random
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from enum import Enum
 from numbers import Number
@@ -32,31 +35,47 @@ KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, propert
 # They are copied as a whole
 DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
 
-# They may consist of numbers and strings
-PLAIN = (Number, str, bytes, list, tuple, set, frozenset, dict)
-
 # Packages of windows and pictures, which belong to the process, too
 DISPLAYS = frozenset({"pygame", "glfw", "OpenGL", "matplotlib"})
 
 # What changes in a space: the random numbers of its samples
 SPACE_STATE = ("_np_random", "spaces")
 
-# Types of which an object can take the state of another one, so that who refers to it sees the change
-_COPY_INTO: dict[type, Callable[[Any, Any], None]] = {
-    np.random.Generator: lambda old, new: setattr(old.bit_generator, "state", new.bit_generator.state),
-    np.random.RandomState: lambda old, new: old.set_state(new.get_state(legacy=False)),
-    random.Random: lambda old, new: old.setstate(new.getstate()),
-}
+
+class NotSaved(ValueError):
+    """An attribute that a state needs cannot be saved."""
 
 
-def register_copy(kind: type, copy_into: Callable[[Any, Any], None]) -> None:
+class Entry(NamedTuple):
     """
-    Have the state of a type of objects, which can be pickled, copied into the object that is there.
+    An object that stays where it is: a holder, or what an attribute of an earlier entry refers to.
 
-    :param kind: The type
-    :param copy_into: Copies the state into its first argument from its second
+    :param owner: Number of the entry whose attribute refers to it; None for a holder
+    :param name: Name of the attribute, or of the holder
+    :param kind: Name of its class, by which it is made where it is not there; None where it cannot be made
     """
-    _COPY_INTO[kind] = copy_into
+
+    owner: int | None
+    name: str
+    kind: str | None
+
+
+class ObjectStates(NamedTuple):
+    """
+    States of objects. It can be pickled, and does not change any more.
+
+    :param entries: The objects
+    :param content: Pickled: for each of them its attributes, or what ``state_dict()`` returned. It refers to the entries by
+        their numbers, and to known objects by their names
+    """
+
+    entries: list[Entry]
+    content: bytes
+
+    @property
+    def holders(self) -> list[str]:
+        """Names of the holders."""
+        return [entry.name for entry in self.entries if entry.owner is None]
 
 
 class _OwnState(NamedTuple):
@@ -81,72 +100,21 @@ def register_state(kind: type, read: Callable[[Any], Any], restore: Callable[[An
         _OWN_STATES.append(_OwnState(kind, read, restore))
 
 
-class NotSaved(ValueError):
-    """An attribute that a state needs cannot be saved."""
-
-
-class SharedObject(NotSaved):
-    """An object is reached by several ways, one of them through a container, and would be several when it is put back."""
-
-
-class Data(NamedTuple):
-    """
-    A value that is copied as a whole.
-
-    :param number: By which :class:`Same` refers to it
-    :param content: Pickled
-    :param parts: Pickled random generators that it contains, such as those of the players in a list, by their numbers
-    """
-
-    number: int
-    content: bytes
-    parts: dict[int, bytes]
-
-
-class Attributes(NamedTuple):
-    """
-    State of an object by its attributes.
-
-    :param number: By which :class:`Same` refers to it
-    :param kind: Name of its class
-    :param values: State of each attribute
-    """
-
-    number: int
-    kind: str
-    values: dict[str, Any]
-
-
-class StateDict(NamedTuple):
-    """
-    What ``state_dict()`` of an object returned.
-
-    :param number: By which :class:`Same` refers to the object
-    :param content: Pickled
-    """
-
-    number: int
-    content: bytes
-
-
-class Same(NamedTuple):
-    """
-    A value whose state stands elsewhere in the same state.
-
-    :param number: Its number
-    """
-
-    number: int
-
-
-class Known(NamedTuple):
-    """
-    An object whose state is kept elsewhere.
-
-    :param name: Its name
-    """
-
-    name: str
+_GENERATORS = (
+    _OwnState(
+        np.random.Generator,
+        lambda rng: rng.bit_generator.state,
+        lambda rng, state: setattr(rng.bit_generator, "state", state),
+    ),
+    _OwnState(np.random.RandomState, lambda rng: rng.get_state(legacy=False), np.random.RandomState.set_state),
+    _OwnState(random.Random, random.Random.getstate, random.Random.setstate),
+)
+_CONTAINERS = (
+    _OwnState(list, list.copy, lambda old, new: old.__setitem__(slice(None), new)),
+    _OwnState(dict, dict.copy, lambda old, new: _replace(old, new)),
+    _OwnState(set, set.copy, lambda old, new: _replace(old, new)),
+)
+_OWN_STATES.extend(_GENERATORS)
 
 
 def object_states(
@@ -154,227 +122,221 @@ def object_states(
     known: Mapping[str, object] | None = None,
     *,
     skip: Mapping[str, Collection[str]] | None = None,
-    strict: bool = False,
+    strict: Collection[str] = (),
     left_out: list[str] | None = None,
-) -> dict[str, Any]:
+) -> ObjectStates:
     """
     :param holders: Objects by names. What several of them refer to is still one object when their states are put back
     :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the states are put back
     :param skip: For each holder the names of its attributes that are not part of its state
-    :param strict: Whether all that a holder refers to is part of its state. Otherwise plain data and tensors are, and objects
-        whose class comes from this package, or from one that a class of the holder comes from
-    :param left_out: Takes the names of what is not part of the state without ``strict``, as ``holder.attribute.attribute``
-    :return: The state of each, which can be pickled and does not change any more
-    :raises NotSaved: With ``strict``, for an attribute that cannot be saved
+    :param strict: Names of the holders of which all that they refer to is part of their state. Of the others, plain data and
+        tensors are, and objects whose class comes from this package, or from one that a class of the holder comes from
+    :param left_out: Takes the names of what is not part of the states of the others, as ``holder.attribute.attribute``
+    :return: The state of each
+    :raises NotSaved: For an attribute of a ``strict`` holder that cannot be saved
     """
-    reader = _Reader({**(known or {}), **holders}, strict, [] if left_out is None else left_out)
-    return {name: reader.holder(holder, name, (skip or {}).get(name, ())) for name, holder in holders.items()}
+    reader = _Reader(holders, known or {}, strict, [] if left_out is None else left_out)
+    for number, (name, holder) in enumerate(holders.items()):
+        reader.read_holder(number, holder, (skip or {}).get(name, ()))
+    return ObjectStates(reader.entries, reader.pickled())
 
 
-def restore_objects(
-    holders: Mapping[str, object], states: Mapping[str, Any], known: Mapping[str, object] | None = None
-) -> None:
+def restore_objects(holders: Mapping[str, object], states: ObjectStates, known: Mapping[str, object] | None = None) -> None:
     """
     Put states back. Attributes that are not part of a state stay as they are.
 
     :param holders: Objects of the same classes as those that the states were read from
     :param states: What :func:`object_states` returned
     :param known: As given to :func:`object_states`
+    :raises ValueError: Naming the object that does not take its state
     """
-    writer = _Writer({**(known or {}), **holders})
-    for name, state in states.items():
-        writer.fill_holder(holders[name], state)
+    found: list[Any] = []
+    taken: set[int] = set()
+    for entry in states.entries:
+        there = holders[entry.name] if entry.owner is None else vars(found[entry.owner]).get(entry.name)
+        # Two objects may have been one in this process until now
+        if entry.kind is not None and (_kind_name(there) != entry.kind or id(there) in taken):
+            there = _make(_find_class(entry.kind))
+        found.append(there)
+        taken.add(id(there))
+    contents = StateUnpickler(io.BytesIO(states.content), {**(known or {}), **dict(enumerate(found))}).load()
+    for number, content in contents.items():
+        entry, value, own = states.entries[number], found[number], _own_state(found[number])
+        if own is not None:
+            try:
+                own.restore(value, content)
+            except ValueError as error:
+                raise ValueError(f"{entry.name}: {error}") from error
+        elif entry.owner is None or entry.kind is not None:  # not an object that this process does without, such as a file
+            _fill(value, content)
 
 
-def object_state(
-    holder: object, known: Mapping[str, object] | None = None, *, skip: Collection[str] = (), strict: bool = False
-) -> Any:
-    """
-    :func:`object_states` of a single object.
-
-    :param holder: An object
-    :param known: See :func:`object_states`
-    :param skip: Names of its attributes that are not part of its state
-    :param strict: See :func:`object_states`
-    :return: Its state
-    """
-    return object_states({"": holder}, known, skip={"": skip}, strict=strict)[""]
+def _replace(old: Any, new: Any) -> None:
+    old.clear()
+    old.update(new)
 
 
-def restore_object(holder: object, state: Any, known: Mapping[str, object] | None = None) -> None:
-    """
-    :param holder: An object of the same class as the one that the state was read from
-    :param state: What :func:`object_state` returned
-    :param known: As given to :func:`object_state`
-    """
-    restore_objects({"": holder}, {"": state}, known)
+def _make(kind: type) -> Any:
+    """An object without content."""
+    if issubclass(kind, np.random.BitGenerator):
+        return np.random.Generator(kind())
+    return kind() if issubclass(kind, np.random.RandomState | random.Random) else kind.__new__(kind)
+
+
+def _fill(value: Any, attributes: Mapping[str, Any]) -> None:
+    for name, new in attributes.items():
+        old = vars(value).get(name)
+        if not _is_kept(old) or (_is_code(old) and _is_code(new)):
+            vars(value)[name] = new
 
 
 class _Reader:
-    def __init__(self, known: Mapping[str, object], strict: bool, left_out: list[str]):
-        self._known = {id(value): name for name, value in known.items()}
-        self._strict, self._left_out = strict, left_out
-        # Numbers of the values that have been met, by id; and these values, so that no other gets the id of one of them
-        self._numbers: dict[int, int] = {}
-        self._met: list[object] = []
+    """Walks over attributes first, so that all entries are known when the data is pickled that may refer to them."""
+
+    def __init__(
+        self, holders: Mapping[str, object], known: Mapping[str, object], strict: Collection[str], left_out: list[str]
+    ):
+        self._left_out = left_out
+        # How data refers to an object: by the name of a known one, or the number of an entry
+        self._references: dict[int, str | int] = {id(value): name for name, value in known.items()}
+        self._references.update({id(holder): number for number, holder in enumerate(holders.values())})
+        self.entries = [Entry(None, name, None) for name in holders]
+        # Of each entry: its attributes or own state, the way to it, and whether all of it has to be saved
+        self._contents: dict[int, Any] = {}
+        self._paths = list(holders)
+        self._strict = [name in strict for name in holders]
+        self._with_attributes: list[int] = []
+        # How many attributes are arrays in the same memory, by the id of the array that it belongs to
+        self._n_arrays: Counter[int] = Counter()
         self._packages: set[str] = set()
-        # With `strict`, the objects that were met inside of containers, by id
-        self._inside: dict[int, object] = {}
 
-    def holder(self, holder: object, name: str, skip: Collection[str]) -> Any:
+    def read_holder(self, number: int, holder: object, skip: Collection[str]) -> None:
         self._packages = {"sb3_cchain", *map(_package, type(holder).__mro__)} - {"builtins"}
-        own = _own_state(holder)
-        if own is not None:
-            return StateDict(self._number(holder), self._pickled(own.read(holder)))
-        return self._attributes(holder, name, skip)
+        self._read(number, holder, skip)
 
-    def _attributes(self, holder: object, path: str, skip: Collection[str] = ()) -> Attributes:
-        number = self._number(holder)
-        values = {}
-        for name, value in vars(holder).items():
-            if name in skip or (isinstance(holder, spaces.Space) and name not in SPACE_STATE):
-                continue
-            state = self._state(value, f"{path}.{name}" if path else name)
-            if state is not None:
-                values[name] = state
-        return Attributes(number, _class_name(type(holder)), values)
-
-    def _state(self, value: Any, path: str) -> Any:
-        if _is_kept(value):
-            return None
-        if id(value) in self._known:
-            return Known(self._known[id(value)])
-        if id(value) in self._numbers:
-            return Same(self._numbers[id(value)])
-        if id(value) in self._inside:
-            raise SharedObject(f"{path}: a container that another attribute refers to holds this object, too")
+    def _read(self, number: int, value: Any, skip: Collection[str] = ()) -> None:
         own = _own_state(value)
         if own is not None:
-            return StateDict(self._number(value), self._pickled(own.read(value)))
-        if self._is_entered(value):
-            return self._attributes(value, path)
-        try:
-            if not self._strict and not _is_data(value):
-                raise NotSaved("an object of another package")
-            return self._data(value)
-        except Exception as error:  # whatever the object's own code raises
-            if self._strict:
-                kind = SharedObject if isinstance(error, SharedObject) else NotSaved
-                raise kind(f"{path}: {error}") from error
-            self._left_out.append(path)
-            return None
+            self._contents[number] = own.read(value)
+            return
+        self._with_attributes.append(number)
+        attributes = self._contents[number] = {}
+        for name, attribute in vars(value).items():
+            if name in skip or (isinstance(value, spaces.Space) and name not in SPACE_STATE):
+                continue
+            if self._is_saved(number, name, attribute):
+                attributes[name] = attribute
 
-    def _is_entered(self, value: Any) -> bool:
-        if isinstance(value, spaces.Space):
+    def _is_saved(self, owner: int, name: str, value: Any) -> bool:
+        """Whether an attribute is part of the state. An object that is met for the first time is read, too."""
+        if _is_kept(value):
+            return self._strict[owner] and _is_code(value)
+        if id(value) in self._references:
             return True
-        return not _is_data(value) and (self._strict or _package(type(value)) in self._packages)
+        own = _own_state(value)
+        if own is not None:
+            self._enter(owner, name, value, _kind_name(value) if own in (*_GENERATORS, *_CONTAINERS) else None)
+        elif isinstance(value, spaces.Space) or (not _is_data(value) and self._is_of_state(owner, value)):
+            self._enter(owner, name, value, _kind_name(value))
+        elif isinstance(value, np.ndarray):
+            self._n_arrays[id(_owner(value))] += 1
+        elif not self._strict[owner] and not _is_data(value):
+            self._left_out.append(self._path(owner, name))
+            return False
+        return True
 
-    def _data(self, value: Any) -> Data:
-        if value is None or isinstance(value, PLAIN):
-            plain = pickle.dumps(value, protocol=5)
-            if pickle.STACK_GLOBAL not in plain:
-                # Numbers and strings only. To look at each of them for known objects takes ten times as long
-                return Data(self._number(value), plain, {})
-        file, parts = io.BytesIO(), dict[int, bytes]()
+    def _is_of_state(self, owner: int, value: object) -> bool:
+        return self._strict[owner] or _package(type(value)) in self._packages
 
-        def refer(part: Any) -> int | None:
-            if part is value:
-                return None
-            # One generator stays one, whether it is met here, in another container or in an attribute
-            if id(part) not in self._numbers:
-                content = self._pickled(part)
-                parts[self._number(part)] = content
-            return self._numbers[id(part)]
+    def _enter(self, owner: int, name: str, value: object, kind: str | None) -> None:
+        number = self._references[id(value)] = len(self.entries)
+        self.entries.append(Entry(owner, name, kind))
+        self._paths.append(self._path(owner, name))
+        self._strict.append(self._strict[owner])
+        self._read(number, value)
 
-        def meet(part: Any) -> None:
-            if part is not value and _is_shareable(part):
-                if id(part) in self._numbers:
-                    raise SharedObject("it holds an object that another attribute refers to, too")
-                self._inside[id(part)] = part
+    def _path(self, owner: int, name: str) -> str:
+        return f"{self._paths[owner]}.{name}" if self._paths[owner] else name
 
-        _DataPickler(file, self._known, refer, meet if self._strict else None).dump(value)
-        return Data(self._number(value), file.getvalue(), parts)
+    def pickled(self) -> bytes:
+        """All contents. What they refer to has to be there until then."""
+        self._filter(lambda number, name, value: not _is_code(value) or self._can_refer_to(value))
+        try:
+            return self._pickle(self._contents)
+        except Exception:  # whatever the code of an object raises
+            self._filter(lambda number, name, value: self._can_pickle(number, value, self._path(number, name)))
+            for number in self._contents.keys() - self._with_attributes:
+                if not self._can_pickle(number, self._contents[number], self._paths[number]):
+                    del self._contents[number]
+            return self._pickle(self._contents)
 
-    def _number(self, value: Any) -> int:
-        self._met.append(value)
-        return self._numbers.setdefault(id(value), len(self._numbers))
+    def _filter(self, is_kept: Callable[[int, str, Any], bool]) -> None:
+        """Keep some of the attributes."""
+        for number in self._with_attributes:
+            content = self._contents[number]
+            self._contents[number] = {name: value for name, value in content.items() if is_kept(number, name, value)}
 
-    def _pickled(self, value: Any) -> bytes:
+    def _can_refer_to(self, code: Any) -> bool:
+        if isinstance(code, MethodType):
+            return id(code.__self__) in self._references and getattr(code.__self__, code.__name__, None) == code
+        try:
+            return _find_class(_name(code)) is code
+        except (AttributeError, ImportError):  # made by other code
+            return False
+
+    def _can_pickle(self, number: int, value: Any, path: str) -> bool:
+        try:
+            self._pickle(value)
+            return True
+        except Exception as error:
+            if self._strict[number]:
+                raise NotSaved(f"{path}: {error}") from error
+            self._left_out.append(path)
+            return False
+
+    def _pickle(self, value: Any) -> bytes:
         file = io.BytesIO()
-        KnownPickler(file, self._known).dump(value)
+        shared = {owner for owner, n_arrays in self._n_arrays.items() if n_arrays > 1}
+        StatePickler(file, self._references, shared).dump(value)
         return file.getvalue()
 
 
-class _Writer:
-    def __init__(self, known: Mapping[str, object]):
-        self._known = known
-        self._values: dict[int, Any] = {}
-
-    def fill_holder(self, holder: object, state: Any) -> None:
-        self._value(holder, state)
-
-    def _fill(self, holder: object, state: Attributes) -> None:
-        for name, value in state.values.items():
-            old = vars(holder).get(name)
-            new = self._value(old, value)
-            # The value is needed even if this process keeps its own: others may be the same one
-            if new is not old and not _is_kept(old):
-                vars(holder)[name] = new
-
-    def _value(self, old: Any, state: Any) -> Any:
-        if isinstance(state, Known):
-            return self._known[state.name]
-        if isinstance(state, Same):
-            return self._values[state.number]
-        if isinstance(state, Attributes):
-            if _class_name(type(old)) != state.kind:
-                kind = _find_class(state.kind)
-                old = kind.__new__(kind)
-            self._values[state.number] = old
-            self._fill(old, state)
-            return old
-        if isinstance(state, StateDict):
-            self._values[state.number] = old
-            own = _own_state(old)
-            if own is not None:  # not an object that this process does without, such as a file
-                own.restore(old, self._unpickled(state.content))
-            return old
-        for number, content in state.parts.items():
-            self._values[number] = self._unpickled(content)
-        new = self._unpickled(state.content)
-        if type(old) is type(new) and type(new) in _COPY_INTO:
-            _COPY_INTO[type(new)](old, new)
-            new = old
-        self._values[state.number] = new
-        return new
-
-    def _unpickled(self, content: bytes) -> Any:
-        return _DataUnpickler(io.BytesIO(content), self._known, self._values).load()
-
-
-class KnownPickler(pickle.Pickler):
+class StatePickler(pickle.Pickler):
     """
-    Refers to known objects by their names, and saves of a tensor no more than the tensor.
+    Refers to objects whose state is kept elsewhere, saves of a tensor no more than the tensor, and keeps the memory layout of
+    arrays.
 
     :param file: Where it writes
-    :param known: Names of the known objects, by their ids
+    :param references: How to refer to these objects, by their ids
+    :param shared: Ids of arrays, views of which stay views
     :param kwargs: Arguments of ``pickle.Pickler``
     """
 
-    def __init__(self, file: Any, known: Mapping[int, str], **kwargs: Any):
+    def __init__(
+        self,
+        file: Any,
+        references: Mapping[int, str] | Mapping[int, str | int],
+        shared: Collection[int] = (),
+        **kwargs: Any,
+    ):
         super().__init__(file, protocol=5, **kwargs)
-        self._known = known
+        self._references = references
+        self._shared = shared
 
-    def persistent_id(self, value: Any) -> str | None:
+    def persistent_id(self, value: Any) -> str | int | None:
         """See ``pickle.Pickler``."""
-        return self._known.get(id(value))
+        return self._references.get(id(value))
 
     def reducer_override(self, value: Any) -> Any:
         """See ``pickle.Pickler``."""
-        if type(value) is np.ndarray and _is_transposed(value):
-            # Pickle would lay it out otherwise, and convolutions round otherwise then
-            order = sorted(range(value.ndim), key=lambda axis: (-abs(value.strides[axis]), value.shape[axis] == 1))
-            return np.transpose, (np.array(value.transpose(order), order="C"), np.argsort(order).tolist())
+        if type(value) is np.ndarray:
+            owner = _owner(value)
+            if owner is not value and id(owner) in self._shared:
+                return np.ndarray, (value.shape, value.dtype, owner, _address(value) - _address(owner), value.strides)
+            return _transposed(value) if _is_transposed(value) else NotImplemented
+        if isinstance(value, EzPickle):
+            # Gymnasium pickles how they were made, not their state
+            raise NotSaved(f"it contains {value}, whose state pickle does not save")
         if not isinstance(value, th.Tensor):
             return NotImplemented
         if not value.is_leaf:
@@ -384,53 +346,32 @@ class KnownPickler(pickle.Pickler):
         return value.__reduce_ex__(5)
 
 
-class KnownUnpickler(pickle.Unpickler):
+class StateUnpickler(pickle.Unpickler):
     """
-    Reads what :class:`KnownPickler` wrote.
+    Reads what :class:`StatePickler` wrote.
 
     :param file: Where it reads
-    :param known: The known objects by their names
+    :param objects: The objects by how they are referred to
     :param kwargs: Arguments of ``pickle.Unpickler``
     """
 
-    def __init__(self, file: Any, known: Mapping[str, object], **kwargs: Any):
+    def __init__(self, file: Any, objects: Mapping[Any, object], **kwargs: Any):
         super().__init__(file, **kwargs)
-        self._known = known
+        self._objects = objects
 
-    def persistent_load(self, name: str) -> object:
+    def persistent_load(self, reference: Any) -> object:
         """See ``pickle.Unpickler``."""
-        return self._known[name]
+        return self._objects[reference]
 
 
-class _DataPickler(KnownPickler):
-    def __init__(
-        self, file: Any, known: Mapping[int, str], refer: Callable[[Any], int | None], meet: Callable[[Any], None] | None
-    ):
-        super().__init__(file, known)
-        self._refer = refer
-        self._meet = meet
-
-    def persistent_id(self, value: Any) -> Any:
-        # Called for every number in it
-        name = self._known.get(id(value))
-        if name is None and self._meet is not None:
-            self._meet(value)
-        return self._refer(value) if name is None and type(value) in _COPY_INTO else name
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, EzPickle):
-            # Gymnasium pickles how they were made, not their state
-            raise NotSaved(f"it contains {value}, whose state pickle does not save")
-        return super().reducer_override(value)
+def _owner(array: np.ndarray) -> np.ndarray:
+    """The array that the memory belongs to, if it can be asked for a part of it; otherwise the array itself."""
+    base = array.base
+    return base if isinstance(base, np.ndarray) and base.flags.c_contiguous and not base.dtype.hasobject else array
 
 
-class _DataUnpickler(KnownUnpickler):
-    def __init__(self, file: Any, known: Mapping[str, object], values: Mapping[int, object]):
-        super().__init__(file, known)
-        self._values = values
-
-    def persistent_load(self, name: Any) -> object:
-        return self._values[name] if isinstance(name, int) else super().persistent_load(name)
+def _address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
 
 
 def _is_transposed(array: np.ndarray) -> bool:
@@ -439,12 +380,22 @@ def _is_transposed(array: np.ndarray) -> bool:
     return array.size > 0 and list(array.strides) != compact and not array.flags.fnc
 
 
+def _transposed(array: np.ndarray) -> Any:
+    # Pickle would lay it out otherwise, and convolutions round otherwise then
+    order = sorted(range(array.ndim), key=lambda axis: (-abs(array.strides[axis]), array.shape[axis] == 1))
+    return np.transpose, (np.array(array.transpose(order), order="C"), np.argsort(order).tolist())
+
+
 def _is_data(value: object) -> bool:
-    return isinstance(value, DATA) or type(value) in _COPY_INTO or not hasattr(value, "__dict__")
+    return isinstance(value, DATA) or not hasattr(value, "__dict__")
 
 
 def _is_kept(value: object) -> bool:
     return isinstance(value, KEPT) or _package(type(value)) in DISPLAYS
+
+
+def _is_code(value: object) -> bool:
+    return isinstance(value, FunctionType | MethodType)
 
 
 def _own_state(value: object) -> _OwnState | None:
@@ -452,14 +403,10 @@ def _own_state(value: object) -> _OwnState | None:
     # Of the class, because wrappers may pass on what their objects are asked for
     if hasattr(kind, "state_dict") and hasattr(kind, "load_state_dict"):
         return _OwnState(kind, kind.state_dict, kind.load_state_dict)
+    for own in _CONTAINERS:
+        if kind is own.kind:
+            return own
     return next((own for own in _OWN_STATES if isinstance(value, own.kind)), None)
-
-
-def _is_shareable(value: object) -> bool:
-    """Whether it matters that a value stays one where several refer to it: it can change, and its type has no rule."""
-    if type(value) in _COPY_INTO or isinstance(value, (*KEPT, Enum, spaces.Space)):
-        return False
-    return isinstance(value, (list, dict, set, np.ndarray)) or hasattr(value, "__dict__")
 
 
 def _package(kind: type) -> str:
@@ -474,9 +421,13 @@ def stock_class(kind: type) -> type:
     return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
 
 
-def _class_name(kind: type) -> str:
-    kind = stock_class(kind)
-    return f"{kind.__module__}:{kind.__qualname__}"
+def _kind_name(value: object) -> str:
+    # A generator can take the state of another one with the same algorithm
+    return _name(stock_class(type(value.bit_generator if isinstance(value, np.random.Generator) else value)))
+
+
+def _name(named: Any) -> str:
+    return f"{named.__module__}:{named.__qualname__}"
 
 
 def _find_class(name: str) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
-from sb3_cchain.checkpoint.object_state import KnownPickler, KnownUnpickler
+from sb3_cchain.checkpoint.object_state import StatePickler, StateUnpickler
 
 # Smaller arrays are not worth a file
 SMALLEST = 2**16
@@ -32,7 +32,7 @@ def save_replay_buffer(buffer: ReplayBuffer, store: ChunkStore, known: Mapping[s
 
     file = io.BytesIO()
     names = {id(value): name for name, value in known.items()}
-    KnownPickler(file, names, buffer_callback=keep).dump(vars(buffer))
+    StatePickler(file, names, buffer_callback=keep).dump(vars(buffer))
     return {"attributes": file.getvalue(), "arrays": arrays}
 
 
@@ -47,4 +47,4 @@ def restore_replay_buffer(
     :raises ValueError: When the store is damaged
     """
     arrays = [store.read(names) for names in state["arrays"]]
-    vars(buffer).update(KnownUnpickler(io.BytesIO(state["attributes"]), known, buffers=arrays).load())
+    vars(buffer).update(StateUnpickler(io.BytesIO(state["attributes"]), known, buffers=arrays).load())

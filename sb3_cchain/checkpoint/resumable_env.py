@@ -1,7 +1,7 @@
 """The state of a single environment with its wrappers."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType
@@ -10,7 +10,7 @@ from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.object_state import NotSaved, SharedObject, object_states, restore_objects, stock_class
+from sb3_cchain.checkpoint.object_state import NotSaved, ObjectStates, object_states, restore_objects, stock_class
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.envs.continual_env import ContinualEnv
 
@@ -49,14 +49,14 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             return None, options[RESUMED]  # type: ignore[return-value]
         return self.env.reset(seed=seed, options=options)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> ObjectStates:
         """
         :return: The state of the environment and its wrappers, which can be pickled and does not change any more
         :raises ValueError: When the environment cannot be saved
         """
         return single_environment_state(self)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: ObjectStates) -> None:
         """
         Put a state back.
 
@@ -92,7 +92,7 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         return attempt(self.state_dict)
 
-    def attempt_load(self, state: dict[str, Any]) -> tuple[str | None, Any]:
+    def attempt_load(self, state: ObjectStates) -> tuple[str | None, Any]:
         """
         ``load_state_dict()`` for other processes.
 
@@ -180,20 +180,46 @@ def can_save_single_environment(env: gym.Env) -> bool:
     return all(layer.is_recorded for layer in _layers(env).values() if isinstance(layer, EpisodeReplay))
 
 
-def single_environment_state(env: gym.Env) -> dict[str, Any]:
+class EnvironmentParts(NamedTuple):
+    """
+    The objects of an environment that have state, as ``object_states()`` takes them.
+
+    :param holders: The environment, its wrappers and, of a continual environment, all tasks, by names
+    :param known: What they refer to and is no state of theirs
+    :param skip: Attributes that are no state
+    :param unused: Tasks that do nothing before their next reset
+    """
+
+    holders: dict[str, object]
+    known: dict[str, object]
+    skip: dict[str, Collection[str]]
+    unused: list[gym.Env]
+
+
+def environment_parts(env: gym.Env, prefix: str = "") -> EnvironmentParts:
     """
     :param env: An environment that :func:`make_resumable` returned
-    :return: Its state and that of its wrappers, by their names; it can be pickled and does not change any more
-    :raises ValueError: When the state cannot be saved
+    :param prefix: What names begin with
+    :return: The objects that have state
     """
     register_simulators()
-    layers = _layers(env)
-    skip = {name: (*CONSTRUCTION, *_times(layer)) for name, layer in layers.items()}
-    with emptied(_tasks_not_under_way(layers)):
-        return object_states(layers, _known(layers), skip=skip, strict=True)
+    layers = _layers(env, prefix)
+    skip: dict[str, Collection[str]] = {name: (*CONSTRUCTION, *_times(layer)) for name, layer in layers.items()}
+    return EnvironmentParts(dict(layers), _known(layers), skip, _tasks_not_under_way(layers))
 
 
-def restore_single_environment(env: gym.Env, state: dict[str, Any]) -> None:
+def single_environment_state(env: gym.Env) -> ObjectStates:
+    """
+    :param env: An environment that :func:`make_resumable` returned
+    :return: Its state and that of its wrappers
+    :raises ValueError: When the state cannot be saved
+    """
+    holders, known, skip, unused = environment_parts(env)
+    with emptied(unused):
+        return object_states(holders, known, skip=skip, strict=holders)
+
+
+def restore_single_environment(env: gym.Env, state: ObjectStates) -> None:
     """
     Put a state back.
 
@@ -201,19 +227,18 @@ def restore_single_environment(env: gym.Env, state: dict[str, Any]) -> None:
     :param state: What :func:`single_environment_state` returned
     :raises ValueError: When the environment has other wrappers
     """
-    register_simulators()
-    layers = _layers(env)
-    check_same_layers(layers, state)
-    restore_objects(layers, state, _known(layers))
+    holders, known, _, _ = environment_parts(env)
+    check_same_layers(holders, state.holders)
+    restore_objects(holders, state, known)
 
 
-def check_same_layers(layers: Mapping[str, object], state: Mapping[str, Any]) -> None:
+def check_same_layers(layers: Iterable[str], saved_layers: Iterable[str]) -> None:
     """
-    :param layers: Environment and wrappers, by their names
-    :param state: State of such ones
+    :param layers: Names of an environment and its wrappers
+    :param saved_layers: Names of those that were saved
     :raises ValueError: Naming the first one that differs
     """
-    present, saved = list(layers), list(state)
+    present, saved = list(layers), list(saved_layers)
     if present == saved:
         return
     shorter = min(len(present), len(saved))
@@ -277,13 +302,7 @@ def _fault(env: gym.Env, layer: gym.Env) -> str | None:
     try:
         # What MuJoCo's data are is known
         with emptied(layers.values()):
-            object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=True)
-    except SharedObject as error:
-        # Neither would an episode that is played again be the same, as it begins with the attributes of that time
-        raise ValueError(
-            f"{layer} cannot be resumed, because its state cannot be saved: {error}. Give its class `state_dict()` and "
-            "`load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
-        ) from error
+            object_states({name: layer}, {**others, **_known(layers)}, skip={name: CONSTRUCTION}, strict=[name])
     except NotSaved as error:
         return str(error)
     return None

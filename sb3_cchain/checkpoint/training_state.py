@@ -1,7 +1,9 @@
 """All that the rest of a training depends on, besides what Stable-Baselines3 saves with a model."""
 
+import pickle
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +16,16 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
-from sb3_cchain.checkpoint.environment_state import environment_state, restore_environment
-from sb3_cchain.checkpoint.object_state import object_states, restore_objects
+from sb3_cchain.checkpoint.environment_state import (
+    VecEnvParts,
+    check_same_environment,
+    remote_states,
+    restore_remotes,
+    vec_env_parts,
+)
+from sb3_cchain.checkpoint.object_state import DATA, object_states, restore_objects
 from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
+from sb3_cchain.checkpoint.simulator_state import emptied
 from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
@@ -34,8 +43,6 @@ _SKIPPED_OF_CALLBACK = frozenset({"model", "parent", "locals", "globals", "_star
 _GSDE_NOISE = ("exploration_mat", "exploration_matrices")
 # What was recorded and not yet written
 _PENDING = ("name_to_value", "name_to_count", "name_to_excluded")
-# Of a model: the episodes under way
-_EPISODE = ("_last_obs", "_last_episode_starts", "_last_original_obs")
 
 
 class TrainingParts(NamedTuple):
@@ -45,11 +52,14 @@ class TrainingParts(NamedTuple):
     :param model: The model
     :param callbacks: All callbacks of ``learn()``, in the order in which they are nested
     :param envs: The environments by name: ``env`` and those that callbacks evaluate in
+    :param arguments: Of each callback, the attributes that are named like arguments of its constructor, pickled as they were
+        when training started; data only
     """
 
     model: BaseAlgorithm
     callbacks: dict[str, BaseCallback]
     envs: dict[str, VecEnv]
+    arguments: dict[str, dict[str, bytes]]
 
     @property
     def known(self) -> dict[str, object]:
@@ -71,6 +81,10 @@ class TrainingParts(NamedTuple):
             known.update({f"{name} layer {number}": layer for number, layer in enumerate(env_layers(env))})
         return known
 
+    def env_parts(self) -> dict[str, VecEnvParts]:
+        """The objects of each environment that have state in this process."""
+        return {name: vec_env_parts(env, f"{name} ") for name, env in self.envs.items()}
+
 
 def training_parts(model: BaseAlgorithm, callback: BaseCallback) -> TrainingParts:
     """
@@ -85,7 +99,17 @@ def training_parts(model: BaseAlgorithm, callback: BaseCallback) -> TrainingPart
     envs = {"env": model.env}
     for name, found in callbacks.items():
         envs.update({f"{name} {key}": value for key, value in vars(found).items() if _is_other_env(value, model.env)})
-    return TrainingParts(model, callbacks, envs)
+    return TrainingParts(model, callbacks, envs, {name: _arguments(found) for name, found in callbacks.items()})
+
+
+def _arguments(callback: BaseCallback) -> dict[str, bytes]:
+    found = {}
+    for name in vars(callback).keys() & constructor_arguments(type(callback)):
+        value = vars(callback)[name]
+        if isinstance(value, DATA):  # not a model or an environment
+            with suppress(Exception):  # whatever the code of an object raises
+                found[name] = pickle.dumps(value, protocol=5)
+    return found
 
 
 def env_layers(env: VecEnv) -> Iterator[VecEnv]:
@@ -113,24 +137,35 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     """
     model, callbacks, known = parts.model, parts.callbacks, parts.known
     left_out: list[str] = []
-    # Callbacks keep the arguments with which the present process made them, such as the files that they write
-    skip = {
-        "model": _SKIPPED_OF_MODEL | _views(model),
-        **{name: _SKIPPED_OF_CALLBACK | constructor_arguments(type(found)) for name, found in callbacks.items()},
-    }
+    envs = parts.env_parts() if with_envs else {}
+    skip: dict[str, Collection[str]] = {"model": _SKIPPED_OF_MODEL | _views(model)}
+    for name, callback in callbacks.items():
+        # Callbacks keep the arguments with which the present process made them, such as the files that they write, but for
+        # those that they change themselves
+        before, now = parts.arguments[name], _arguments(callback)
+        changed = {argument for argument in before.keys() & now.keys() if before[argument] != now[argument]}
+        skip[name] = _SKIPPED_OF_CALLBACK | (constructor_arguments(type(callback)) - changed)
+    holders: dict[str, object] = {"model": model, **callbacks}
+    strict: list[str] = []
+    for env in envs.values():
+        holders.update(env.holders)
+        known.update(env.known)
+        skip.update(env.skip)
+        strict += env.strict
+    # All in one, because callbacks and environments may refer to the same objects
+    with emptied([task for env in envs.values() for task in env.unused]):
+        objects = object_states(holders, known, skip=skip, strict=strict, left_out=left_out)
     buffer = getattr(model, "replay_buffer", None)
     state: dict[str, Any] = {
-        "objects": object_states({"model": model, **callbacks}, known, skip=skip, left_out=left_out),
+        "objects": objects,
+        "envs": {name: (parts.envs[name].num_envs, remote_states(parts.envs[name])) for name in envs} if with_envs else None,
         "gsde_noise": [
             {name: vars(noise)[name].detach() for name in _GSDE_NOISE if name in vars(noise)} for noise in _gsde(model)
         ],
         "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, known),
-        "envs": {name: environment_state(env) for name, env in parts.envs.items()} if with_envs else None,
         "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
         "random": _random_state(),
     }
-    for name, env_state in (state["envs"] or {}).items():
-        left_out += [f"{name} {attribute}" for attribute in env_state["left_out"]]
     return state, left_out
 
 
@@ -162,18 +197,21 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
     :param store: The big arrays
     """
     model, known = parts.model, parts.known
+    envs = {} if state["envs"] is None else parts.env_parts()
+    holders: dict[str, object] = {"model": model, **parts.callbacks}
+    for name, env in envs.items():
+        saved_layers = [layer for layer in state["objects"].holders if layer.startswith(f"{name} ")]
+        check_same_environment(parts.envs[name], env.holders, state["envs"][name][0], saved_layers)
+        holders.update(env.holders)
+        known.update(env.known)
     _restore_parameters(model, model_path)
-    fresh = {name: vars(model)[name] for name in _EPISODE if name in vars(model)}
-    restore_objects({"model": model, **parts.callbacks}, state["objects"], known)
+    restore_objects(holders, state["objects"], known)
+    for name in envs:
+        restore_remotes(parts.envs[name], state["envs"][name][1])
     for noise, saved in zip(_gsde(model), state["gsde_noise"], strict=True):
         vars(noise).update(saved)
     if state["replay_buffer"] is not None:
         restore_replay_buffer(model.replay_buffer, state["replay_buffer"], store, known)  # type: ignore[attr-defined]
-    if state["envs"] is None:
-        vars(model).update(fresh)
-    else:
-        for name, env in parts.envs.items():
-            restore_environment(env, state["envs"][name])
     for name, values in state["logged"].items():
         vars(model.logger)[name].clear()
         vars(model.logger)[name].update(values)

@@ -32,9 +32,13 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     :param steps_per_task: Environment steps per task, one number for all or one per task
     :param n_envs: How many environments step together with this one, itself included
     :param first_task: The task to begin with; those before it are left out
+    :param cycles: How often the sequence comes, one time after the other. Each visit is a task with a number of its own
+    :param blend_steps: Environment steps in which each task but the first drifts from the one before to itself, in place of a
+        sudden switch: of the task's own. The number of the task changes when the drift begins. Only for subclasses whose tasks
+        differ in numbers, which say by :meth:`blend` what lies between two of them
     :param render_mode: As in :func:`gymnasium.make`
     :raises ValueError: For an empty task list, lengths that are not positive or not one per task, an unknown environment,
-        or tasks whose spaces differ
+        tasks whose spaces differ, or a ``blend_steps`` that is longer than a task or for tasks that have nothing between them
     :raises TypeError: When ``tasks`` is not a list of environment ids and callables, or a callable makes no environment
     :raises ImportError: When the package that a task needs is not installed
     """
@@ -49,13 +53,18 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         *,
         n_envs: int = 1,
         first_task: int = 0,
+        cycles: int = 1,
+        blend_steps: int = 0,
         render_mode: str | None = None,
     ):
         tasks = _check_tasks(tasks)
-        self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks))
+        check_number("cycles", cycles, 1, integer=True)
+        self.cycles = int(cycles)
+        self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks)) * self.cycles
+        self.blend_steps = self._check_blend_steps(blend_steps)
         # The time of the sequence, and the task of the present episode
         self.clock = TaskClock(self.steps_per_task, n_envs, first_task)
-        self.tasks = [_make_task(position, task, render_mode) for position, task in enumerate(tasks)]
+        self.tasks = [_make_task(position, task, render_mode) for position, task in enumerate(tasks * self.cycles)]
         _check_spaces(self.tasks)
 
         self.observation_space = self.tasks[0].observation_space
@@ -63,6 +72,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         self.metadata = self.tasks[0].metadata
         self.render_mode = render_mode
         self._seeded: set[int] = set()
+        # How far each task has drifted to itself; those that are not there are themselves
+        self._weights: dict[int, float] = {}
 
     @property
     def task_id(self) -> int:
@@ -89,8 +100,17 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         """
         A description of each task. Two environments whose descriptions are equal have the same tasks. A subclass describes its
         tasks by the arguments that tell them apart: by numbers, strings, lists or tuples, which can be compared and pickled.
+        With ``cycles``, the descriptions come so often.
         """
         return [_name(task) for task in self.tasks]
+
+    def blend(self, weight: float) -> None:
+        """
+        Put the present task between the task before it and itself. A subclass overrides it to allow ``blend_steps``.
+
+        :param weight: 0 for the task before, 1 for the present one
+        """
+        raise NotImplementedError
 
     def set_clock(self, total_steps: int, n_envs: int | None = None) -> bool:
         """
@@ -129,6 +149,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
             # One seed determines the whole sequence
             self._seeded.add(self.task_id)
             seed = int(self.np_random.integers(2**31))
+        if self.blend_steps:
+            self._drift()
         observation, info = self.task.reset(seed=seed, options=options)
         self._episode_return = 0.0
         return observation, {**info, "task_id": self.task_id}
@@ -141,12 +163,30 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         :return: Observation, reward, terminated, truncated, info
         """
         task_id = self.clock.task_id
+        if self.blend_steps:
+            self._drift()
         observation, reward, terminated, truncated, info = self.tasks[task_id].step(action)
         truncated = self.clock.advance() or truncated
         task_reward = float(reward)
         self._episode_return += task_reward
         info = {**info, "task_id": task_id, "task_reward": task_reward, "episode_return": self._episode_return}
         return observation, reward, terminated, truncated, info
+
+    def _drift(self) -> None:
+        task_id = self.task_id
+        weight = 1.0 if task_id == self.first_task else min(self.clock.task_steps / self.blend_steps, 1.0)
+        if weight != self._weights.get(task_id, 1.0):
+            self._weights[task_id] = weight
+            self.blend(weight)
+
+    def _check_blend_steps(self, blend_steps: int) -> int:
+        check_number("blend_steps", blend_steps, 0, min(self.steps_per_task), integer=True)
+        if blend_steps and type(self).blend is ContinualEnv.blend:
+            raise ValueError(
+                f"`blend_steps` must be 0 for {type(self).__name__}, got {blend_steps!r}: nothing is known to lie between two "
+                "of its tasks. In a subclass whose tasks differ in numbers, override `blend()`"
+            )
+        return int(blend_steps)
 
     def render(self) -> RenderFrame | list[RenderFrame] | None:
         """
@@ -206,7 +246,7 @@ def _check_spaces(tasks: list[gym.Env]) -> None:
             if space != first:
                 raise ValueError(
                     f"All tasks must have the same {kind}, but task 0 ({_name(tasks[0])}) has {first} and task {position} "
-                    f"({_name(task)}) has {space}. Wrap the tasks so that they agree, for instance by padding."
+                    f"({_name(task)}) has {space}. Wrap the tasks so that they agree, for instance by CommonSpaces."
                 )
 
 

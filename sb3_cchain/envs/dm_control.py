@@ -80,6 +80,7 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating]]
     :param steps_per_task: Environment steps per task, one number for all or one per task
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: As in :func:`gymnasium.make`
     :raises TypeError: When ``tasks`` is a string or not a list
     :raises ValueError: Naming the argument that is out of its range
@@ -94,16 +95,17 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating]]
         steps_per_task: int | Sequence[int] = 1_000_000,
         n_envs: int = 1,
         first_task: int = 0,
+        cycles: int = 1,
         render_mode: str | None = None,
     ):
         self.domain, self.task_names = domain, _check_task_names(domain, tasks)
         makers = [partial(_make_task, domain, name) for name in self.task_names]
-        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
 
     @property
     def task_sequence(self) -> list[tuple[str, str]]:
         """The domain and the name of each task."""
-        return [(self.domain, name) for name in self.task_names]
+        return [(self.domain, name) for name in self.task_names] * self.cycles
 
 
 def _known_tasks() -> dict[str, Sequence[str]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -68,6 +68,9 @@ class ContinualGymControl(ContinualEnv):
     :param offsets: The offsets themselves, ``(n_tasks, *observation_shape)``; read back as the attribute ``offsets``
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param cycles: See :class:`~sb3_cchain.ContinualEnv`; ``n_tasks`` and ``offsets`` are of one cycle
+    :param blend_steps: See :class:`~sb3_cchain.ContinualEnv`. The offset goes from that of the task before to the task's own
+        in a straight line
     :param render_mode: As in :func:`gymnasium.make`
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When the package that the environment needs is not installed
@@ -84,6 +87,8 @@ class ContinualGymControl(ContinualEnv):
         offsets: ArrayLike | None = None,
         n_envs: int = 1,
         first_task: int = 0,
+        cycles: int = 1,
+        blend_steps: int = 0,
         render_mode: str | None = None,
     ):
         check_number("n_tasks", n_tasks, 1, integer=True)
@@ -97,12 +102,50 @@ class ContinualGymControl(ContinualEnv):
         else:
             self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
-        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+        # What is missing to the task's own offset. Added here, so that the tasks themselves stay as they are
+        self._missing_offset = np.zeros_like(self.offsets[0])
+        super().__init__(
+            tasks,
+            steps_per_task,
+            n_envs=n_envs,
+            first_task=first_task,
+            cycles=cycles,
+            blend_steps=blend_steps,
+            render_mode=render_mode,
+        )
 
     @property
     def task_sequence(self) -> list[tuple[str, list[float]]]:
         """The environment and the offset of each task."""
-        return [(self.env_id, offset.tolist()) for offset in self.offsets]
+        return [(self.env_id, offset.tolist()) for offset in self.offsets] * self.cycles
+
+    def blend(self, weight: float) -> None:
+        """
+        :param weight: 0 for the offset of the task before, 1 for that of the present task
+        """
+        before, own = (self.offsets[task % len(self.offsets)] for task in (self.task_id - 1, self.task_id))
+        self._missing_offset = ((1 - weight) * (before - own)).astype(np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
+        """
+        :param seed: Seeds this and all later tasks
+        :param options: Passed on to the task
+        :return: Observation and info
+        """
+        observation, info = super().reset(seed=seed, options=options)
+        return self._drifting(observation), info
+
+    def step(self, action: Any) -> tuple[NDArray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        :param action: The action
+        :return: Observation, reward, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = super().step(action)
+        return self._drifting(observation), reward, terminated, truncated, info
+
+    def _drifting(self, observation: NDArray) -> NDArray:
+        is_itself = not self.blend_steps or self._weights.get(self.task_id, 1.0) == 1
+        return observation if is_itself else observation + self._missing_offset
 
 
 def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -150,6 +150,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     :param difficulty_ramping: Whether Asterix, Seaquest and SpaceInvaders get harder during an episode
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: As in :func:`gymnasium.make`
     :raises TypeError: When ``games`` is a string or not a list, or ``difficulty_ramping`` is not a boolean
     :raises ValueError: Naming the argument that is out of its range
@@ -166,6 +167,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
         difficulty_ramping: bool = True,
         n_envs: int = 1,
         first_task: int = 0,
+        cycles: int = 1,
         render_mode: str | None = None,
     ):
         self.games = _check_games(games)
@@ -173,12 +175,12 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
         check_bool("difficulty_ramping", difficulty_ramping)
         settings = {"sticky_action_prob": sticky_action_prob, "difficulty_ramping": difficulty_ramping}
         tasks = [partial(_make_game, game, n_channels, **settings) for game in self.games]
-        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
 
     @property
     def task_sequence(self) -> list[str]:
         """The game of each task."""
-        return list(self.games)
+        return self.games * self.cycles
 
 
 def _check_games(games: Sequence[str]) -> list[str]:

@@ -243,6 +243,7 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
     :param distribution_mode: See :class:`~sb3_cchain.envs.ProcgenGame`
     :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
     :param first_task: See :class:`~sb3_cchain.ContinualEnv`
+    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
     :param render_mode: ``"rgb_array"`` or ``None``; ``gymnasium.make`` takes ``"human"`` too
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When procgen is not installed
@@ -261,6 +262,7 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
         distribution_mode: str = "hard",
         n_envs: int = 1,
         first_task: int = 0,
+        cycles: int = 1,
         render_mode: str | None = None,
     ):
         _check_game(game, distribution_mode)
@@ -272,12 +274,12 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
         self.levels = [range(start, start + int(num_levels)) for start in starts]
         make_task = partial(ProcgenGame, game, num_levels=num_levels, distribution_mode=distribution_mode)
         tasks = [partial(make_task, start_level=start) for start in starts]
-        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, render_mode=render_mode)
+        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
 
     @property
     def task_sequence(self) -> list[tuple[str, int, int]]:
         """The game of each task, its first level and its number of levels."""
-        return [(self.game, levels.start, len(levels)) for levels in self.levels]
+        return [(self.game, levels.start, len(levels)) for levels in self.levels] * self.cycles
 
 
 def _copy(observation: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:

@@ -6,6 +6,7 @@ from sb3_cchain.envs.procgen import GAME_NAMES
 
 # Keyword arguments of `gymnasium.register` by the id without its namespace. `kwargs` holds only arguments that differ from
 # the defaults of the entry point; each of them can be given to `gymnasium.make`, too.
+# These are the paper's.
 _GYM_CONTROL = {"entry_point": "sb3_cchain.envs.gym_control:ContinualGymControl", "max_episode_steps": 400}
 _DM_CONTROL = "sb3_cchain.envs.dm_control:ContinualDMControl"
 _PROCGEN = "sb3_cchain.envs.procgen:ContinualProcgen"
@@ -25,10 +26,18 @@ CONTINUAL_ENVS: dict[str, dict] = {
     **{f"{game}-v0": {"entry_point": _PROCGEN, "kwargs": {"game": game.lower()}} for game in GAME_NAMES},
 }
 
+# Those that the paper does not have
+OTHER_ENVS: dict[str, dict] = {
+    "SlipperyAnt-v0": {"entry_point": "sb3_cchain.envs.slippery_ant:ContinualSlipperyAnt"},
+    "MiniGrid-v0": {"entry_point": "sb3_cchain.envs.minigrid:ContinualMiniGrid"},
+    "Atari-v0": {"entry_point": "sb3_cchain.envs.atari:ContinualAtari"},
+    "Sequence-v0": {"entry_point": "sb3_cchain.envs.space_padding:ContinualSequence"},
+}
+
 
 def register_envs() -> None:
     """Register ``Continual/...`` with Gymnasium. Importing ``sb3_cchain`` does so."""
-    for name, registration in CONTINUAL_ENVS.items():
+    for name, registration in (CONTINUAL_ENVS | OTHER_ENVS).items():
         env_id = f"Continual/{name}"
         if env_id not in gym.registry:
             gym.register(env_id, **registration)

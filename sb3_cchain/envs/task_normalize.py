@@ -9,7 +9,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
-from sb3_cchain.tasks.signal import TaskSwitch, first_reset_info
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.validation import check_bool
 
 Observation = NDArray | dict[str, NDArray]
@@ -25,7 +25,8 @@ class TaskVecNormalize(VecNormalize):
     and the first in the new statistics.
 
     It reads the task from ``task_id`` in the infos of the first environment; environments side by side switch together.
-    Without a ``task_id``, while the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With
+    With a :class:`~sb3_cchain.TaskSignal` in ``learn()``, it restarts where that says, from the step after its word on.
+    Without either, while the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With
     ``training=False`` statistics are neither updated nor restarted, so that an evaluation environment has the statistics of
     training (``EvalCallback`` copies them).
 
@@ -45,8 +46,8 @@ class TaskVecNormalize(VecNormalize):
     :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward`` or ``restart`` is not a boolean
     """
 
-    # Attributes that a saved TaskVecNormalize goes on with; `_switch` knows the task that the statistics are of
-    statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch"})
+    # Attributes that a saved TaskVecNormalize goes on with; the switches know the task that the statistics are of
+    statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch", "_signal_switch"})
 
     def __init__(
         self,
@@ -69,6 +70,8 @@ class TaskVecNormalize(VecNormalize):
         self.restart = restart
         # Of no task before the first step, and where tasks have no number
         self._switch = TaskSwitch()
+        # The same by the word of a TaskSignal, which may number tasks otherwise
+        self._signal_switch = TaskSwitch()
         self._before_reset: dict[str, Any] | None = None
 
     def reset(self) -> Observation:
@@ -123,7 +126,9 @@ class TaskVecNormalize(VecNormalize):
         if not self._follows_tasks():
             return False
         # The vectorised environment has begun the next episode by itself; the info of the step is still that of the old one
-        return self._switch.happened(first_reset_info(self.venv).get("task_id"))
+        switched = self._switch.happened(first_reset_info(self.venv).get(TASK_KEY))
+        signal = active_signal(self.venv)
+        return switched if signal is None else self._signal_switch.happened(signal.next_task)
 
     def _restart(self) -> None:
         if self.norm_obs:

@@ -1,6 +1,7 @@
 """The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm; the table of all methods."""
 
 from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.exploration import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
@@ -15,7 +16,10 @@ from sb3_cchain.methods.weight_clipping import WeightClipping
 __all__ = [
     "TRAC",
     "AdamRel",
+    "EntropyBonusRestart",
+    "ExplorationRateRestart",
     "L2Init",
+    "LogStdRestart",
     "OptimizerMetrics",
     "OptimizerWrapper",
     "Oracle",

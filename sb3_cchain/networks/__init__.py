@@ -5,6 +5,7 @@ from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.mlp_policies import CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
+from sb3_cchain.networks.transfer import Transferred, transfer
 
 __all__ = [
     "CReLU",
@@ -15,5 +16,7 @@ __all__ = [
     "LayerNormDQNPolicy",
     "LayerNormPolicy",
     "MinAtarCNN",
+    "Transferred",
     "make_lean",
+    "transfer",
 ]

@@ -4,15 +4,15 @@ from abc import abstractmethod
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.tasks.callback_tree import require_single
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, require_tasks
-from sb3_cchain.tasks.sync import warn_without_sync
+from sb3_cchain.tasks.listening import start_listening
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task
 
 
 class TaskBoundary(BaseCallback):
     """
-    Base of callbacks that act when the task has switched: that of a :class:`~sb3_cchain.ContinualEnv`, or from one call of
-    ``learn(..., reset_num_timesteps=False)`` to the next the environment that ``set_env()`` gave.
+    Base of callbacks that act when the task has switched: that of a :class:`~sb3_cchain.ContinualEnv`, by the word of a
+    :class:`~sb3_cchain.TaskSignal`, or from one call of ``learn(..., reset_num_timesteps=False)`` to the next the environment
+    that ``set_env()`` gave.
 
     They act between rollouts: before the first action of the first rollout that begins in the new task. Where tasks last
     for whole rollouts, as in the paper's experiments, and in DQN with ``train_freq=1``, that is exactly at the switch: no
@@ -26,25 +26,18 @@ class TaskBoundary(BaseCallback):
     """
 
     def _on_training_start(self) -> None:
-        require_tasks(self)
-        require_single(self)
-        warn_without_sync(self)
+        start_listening(self)
         # Training that begins at step 0 begins with its first task, not with what the model was trained on before
         known = getattr(self.model, "trained_task_id", None) if self.num_timesteps > 0 else None
         self._switch = TaskSwitch(known)
-        self._may_have_switched = True
 
     def _on_rollout_start(self) -> None:
-        if self._may_have_switched:
-            self._may_have_switched = False
-            switched = self._switch.happened(episode_task(self.model))
-            self.model.trained_task_id = self._switch.task_id  # type: ignore[attr-defined]
-            if switched:
-                self._on_task_switch()
+        switched = self._switch.happened(episode_task(self.model))
+        self.model.trained_task_id = self._switch.task_id  # type: ignore[attr-defined]
+        if switched:
+            self._on_task_switch()
 
     def _on_step(self) -> bool:
-        # A switch ends an episode
-        self._may_have_switched |= any(self.locals["dones"].tolist())
         return True
 
     @abstractmethod

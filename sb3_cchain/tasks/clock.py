@@ -1,5 +1,6 @@
 """Which task of a sequence is due, counted in environment steps."""
 
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate
@@ -44,6 +45,11 @@ class TaskClock:
     def is_pinned(self) -> bool:
         """Whether it stays on one task."""
         return self._pinned_task is not None
+
+    @property
+    def task_steps(self) -> float:
+        """Environment steps made since the present task began, over all environments; infinite when pinned to a task."""
+        return math.inf if self.is_pinned else self._total_steps - [0, *self._ends][self.task_id]
 
     @property
     def is_over(self) -> bool:

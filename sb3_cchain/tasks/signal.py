@@ -1,14 +1,13 @@
 """
 The one signal that the task has switched.
 
-Callbacks, methods, metrics and the reset of λ all listen to it: each of them keeps a :class:`TaskSwitch` and shows it the
-present task, as :func:`step_task` or :func:`episode_task` tell it. Both ask the same sources, in this order:
+Callbacks, methods, metrics and the reset of λ all listen to it. Each of them keeps a :class:`TaskSwitch` and shows it the
+present task, as :func:`step_task` (after a step) or :func:`episode_task` (before the next one) tells it. Both ask in this
+order, and the first that knows the task decides:
 
-1. The environment, which numbers its tasks in ``info["task_id"]``, as :class:`~sb3_cchain.ContinualEnv` does.
-2. The model's ``set_env()``: where the environment gives no number, the next task begins when the model is trained in another
-   environment than before. An environment that comes again is a new task, too.
-
-Another source of switches (a call by the user, a test that detects them) belongs here, in ``step_task``.
+1. The :class:`~sb3_cchain.TaskSignal` that ``learn()`` was given, which counts the switches that its source reports.
+2. The environment, where it numbers its tasks in ``info["task_id"]``, as :class:`~sb3_cchain.ContinualEnv` does.
+3. The model's count of the environments that ``set_env()`` gave and of the calls of :func:`task_switched`.
 """
 
 from typing import Any
@@ -18,6 +17,9 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
+
+# Where an environment that numbers its tasks does so
+TASK_KEY = "task_id"
 
 
 class TaskSwitch:
@@ -46,18 +48,24 @@ def step_task(model: BaseAlgorithm, infos: list[dict[str, Any]]) -> Any:
     :param infos: The infos of a step
     :return: The task that the step was made in. It tells of a switch one step after the switch.
     """
-    info = infos[0]
-    return info["task_id"] if "task_id" in info else _env_number(model)
+    assert model.env is not None
+    signal = active_signal(model.env)
+    return _known_task(model, infos[0]) if signal is None else signal.step_task
 
 
 def episode_task(model: BaseAlgorithm) -> Any:
     """
     :param model: A model during ``learn()``
-    :return: The task that the next step will be made in. It tells of a switch at once: the step that ends a task ends an
-        episode, and the vectorised environment has already begun the next episode.
+    :return: The task that the next step will be made in. It tells of a switch at once: where the environment numbers its
+        tasks, the step that ends a task ends an episode, and the vectorised environment has already begun the next one.
     """
     assert model.env is not None
-    return step_task(model, [first_reset_info(model.env)])
+    signal = active_signal(model.env)
+    return _known_task(model, first_reset_info(model.env)) if signal is None else signal.next_task
+
+
+def _known_task(model: BaseAlgorithm, info: dict[str, Any]) -> Any:
+    return info[TASK_KEY] if TASK_KEY in info else task_count(model)
 
 
 def first_reset_info(env: VecEnv) -> dict[str, Any]:
@@ -68,23 +76,80 @@ def first_reset_info(env: VecEnv) -> dict[str, Any]:
     return env.unwrapped.reset_infos[0]
 
 
+# The TaskSignal that was given to learn(), by the vectorised environment that is trained in
+_signals: WeakKeyDictionary[VecEnv, ref[Any]] = WeakKeyDictionary()
+
+
+def register_signal(signal: Any) -> None:
+    """
+    :param signal: A :class:`~sb3_cchain.TaskSignal`, when training starts. Its ``learn()`` hears of switches from it alone.
+    """
+    _signals[signal.training_env.unwrapped] = ref(signal)
+
+
+def active_signal(env: VecEnv) -> Any:
+    """
+    :param env: A vectorised environment
+    :return: The :class:`~sb3_cchain.TaskSignal` of the ``learn()`` that trains in it; None where there is none
+    """
+    found = _signals.get(env.unwrapped)
+    signal = None if found is None else found()
+    return signal if signal is not None and signal.is_active else None
+
+
 # The environment that each model was last trained in. It is not saved with the model: where training is resumed, the same
 # environment is another object.
 _last_envs: WeakKeyDictionary[BaseAlgorithm, ref[Any]] = WeakKeyDictionary()
 
 
-def _env_number(model: BaseAlgorithm) -> int:
-    """How often the model has changed to another environment. The number is kept as ``model.env_number``."""
+def task_count(model: BaseAlgorithm) -> int:
+    """
+    :param model: A model during ``learn()``
+    :return: How often it has changed to another environment, plus the calls of :func:`task_switched`. An environment that
+        comes again is a new task, too. The number is kept as ``model.task_count``.
+    """
+    if model.num_timesteps == 0:
+        model.task_count = 0  # type: ignore[attr-defined]
+    elif has_other_env(model):
+        _count_one_more(model)
+    _last_envs[model] = ref(_single_env(model))
+    return getattr(model, "task_count", 0)
+
+
+def has_other_env(model: BaseAlgorithm) -> bool:
+    """
+    :param model: A model during ``learn()``
+    :return: Whether its environment is another one than at the last :func:`task_count`
+    """
+    return model in _last_envs and _last_envs[model]() is not _single_env(model)
+
+
+def _single_env(model: BaseAlgorithm) -> Any:
     assert model.env is not None
     env = model.env.unwrapped
     # set_env() wraps the same environment again
-    env = env.envs[0].unwrapped if hasattr(env, "envs") else env
-    if model.num_timesteps == 0:
-        model.env_number = 0  # type: ignore[attr-defined]
-    elif model in _last_envs and _last_envs[model]() is not env:
-        model.env_number = getattr(model, "env_number", 0) + 1  # type: ignore[attr-defined]
-    _last_envs[model] = ref(env)
-    return getattr(model, "env_number", 0)
+    return env.envs[0].unwrapped if hasattr(env, "envs") else env
+
+
+def task_switched(model: BaseAlgorithm) -> None:
+    """
+    Say that the world has changed: the next step of training is in a new task. Call it between two calls of
+    ``learn(..., reset_num_timesteps=False)``, or in a callback during training.
+
+    :param model: A model of Stable-Baselines3, sb3-contrib or this package
+    :raises ValueError: When the environment numbers its tasks itself, in ``info["task_id"]``, and no
+        :class:`~sb3_cchain.TaskSignal` is given to ``learn()``
+    """
+    if model.env is not None and active_signal(model.env) is None and TASK_KEY in first_reset_info(model.env):
+        raise ValueError(
+            f"`task_switched()` is not heard where the environment numbers its tasks itself, in info[{TASK_KEY!r}]. Leave it "
+            "out, or have both count by giving `learn()` a TaskSignal."
+        )
+    _count_one_more(model)
+
+
+def _count_one_more(model: BaseAlgorithm) -> None:
+    model.task_count = getattr(model, "task_count", 0) + 1  # type: ignore[attr-defined]
 
 
 def is_continual(env: VecEnv | None) -> bool:
@@ -105,19 +170,3 @@ def require_continual(callback: BaseCallback) -> None:
             f"{type(callback).__name__} is for continual environments, but the training environment is not one. "
             'Make it with gymnasium.make("Continual/...") or sb3_cchain.ContinualEnv.'
         )
-
-
-def require_tasks(callback: BaseCallback) -> None:
-    """
-    :param callback: A callback that acts when the task switches, when training starts
-    :raises TypeError: When there cannot be a switch: the environment is not continual, and this call of ``learn()`` neither
-        continues training nor says that it is one of several
-    """
-    if callback.locals.get("reset_num_timesteps", True):
-        try:
-            require_continual(callback)
-        except TypeError as error:
-            raise TypeError(
-                f"{error} Or train in one environment after the other, each given by `model.set_env()` and "
-                "trained in by `model.learn(..., reset_num_timesteps=False)`."
-            ) from None

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.evaluation import check_same_tasks, evaluate_on, find_eval_envs
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, is_continual, require_continual, step_task
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info, is_continual, require_continual
 
 
 class TaskSync(BaseCallback):
@@ -41,13 +41,14 @@ class TaskSync(BaseCallback):
             vec_normalize = self.model.get_vec_normalize_env()
             if vec_normalize is not None:
                 self.model._last_original_obs = vec_normalize.get_original_obs()
-        self._switch = TaskSwitch(episode_task(self.model))
+        # The environment's own number, whatever the signal is
+        self._switch = TaskSwitch(first_reset_info(env)[TASK_KEY])
         self._eval_envs = eval_envs
         evaluate_on(self._switch.task_id, eval_envs)
 
     def _on_step(self) -> bool:
         if self._eval_envs:
-            task_id = step_task(self.model, self.locals["infos"])
+            task_id = self.locals["infos"][0][TASK_KEY]
             if self._switch.happened(task_id):
                 evaluate_on(task_id, self._eval_envs)
         return True

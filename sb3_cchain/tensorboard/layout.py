@@ -19,6 +19,12 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Task being trained": "continual/task_id",
         "Reward per episode": "rollout/ep_rew_mean|eval/mean_reward",
     },
+    "Evaluations on all tasks": {
+        "Mean return on each task": r"continual_eval/task_\d+",
+        "Mean return over all tasks": "continual_eval/average",
+        "Forgetting, mean over the tasks that were left": "continual_eval/forgetting",
+        "Zero-shot transfer, mean over the tasks to come": "continual_eval/zero_shot_transfer",
+    },
     "C-CHAIN": {
         "Policy churn of an update": "churn/policy_churn",
         "Value churn of an update": "churn/value_churn",

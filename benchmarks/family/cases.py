@@ -1,0 +1,283 @@
+"""What is compared: one row for each case."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
+from stable_baselines3 import DQN, PPO, SAC, TD3, HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise
+from torch import nn
+
+from benchmarks.family.masked_symbols import continual_masked_symbols
+from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
+from sb3_cchain.algorithms.contrib import CChainMaskablePPO, CChainQRDQN, CChainRecurrentPPO
+
+
+@dataclass(frozen=True)
+class Variant:
+    """
+    An algorithm in a case.
+
+    :param label: Human-readable name
+    :param algorithm: Its class
+    :param arguments: Arguments beside the settings of the case
+    """
+
+    label: str
+    algorithm: type[BaseAlgorithm]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    A comparison.
+
+    :param title: Environment and algorithm, human-readable
+    :param source: Where the settings come from
+    :param env: Environment id, or what makes the environment
+    :param variants: What is compared, by the name of the files of results. C-CHAIN is compared with the first one
+    :param steps: Environment steps of a run
+    :param eval_freq: Environment steps between two evaluations
+    :param seeds: Number of seeds
+    :param settings: Arguments of all variants
+    :param env_kwargs: Arguments of the environment
+    :param n_envs: Environments side by side
+    :param n_eval_episodes: Episodes of an evaluation, on the task being trained
+    :param n_tasks: Tasks of equal length, one after the other
+    :param normalize: Whether ``VecNormalize`` normalises observations and rewards
+    :param policy: Policy
+    :param score: Column of the results that is compared
+    :param solved: Mean return that counts as solved, where the case asks whether what was learned stays
+    :param worst: Return of an agent that can do nothing, there
+    """
+
+    title: str
+    source: str
+    env: str | Callable[..., gym.Env]
+    variants: Mapping[str, Variant]
+    steps: int
+    eval_freq: int
+    seeds: int = 5
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    n_envs: int = 1
+    n_eval_episodes: int = 10
+    n_tasks: int = 1
+    normalize: bool = False
+    policy: str = "MlpPolicy"
+    score: str = "mean_return"
+    solved: float | None = None
+    worst: float = 0.0
+
+
+def _noise(n_actions: int) -> NormalActionNoise:
+    return NormalActionNoise(np.zeros(n_actions), np.full(n_actions, 0.1))
+
+
+RL_ZOO = "RL Zoo's settings"
+CHAIN = "settings of the code released with CHAIN"
+
+# C-CHAIN's DQN has Double Q-learning, so Double DQN is what it is compared with
+_DQN = {
+    "double_dqn": Variant("Double DQN", DoubleDQN),
+    "cchain": Variant("C-CHAIN DQN", CChainDQN),
+    "dqn": Variant("DQN", DQN),
+}
+_SAC = {
+    "sac": Variant("SAC", SAC),
+    "cchain": Variant("C-CHAIN SAC", CChainSAC),
+    "cchain_value": Variant("C-CHAIN SAC (values)", CChainSAC, {"churn_target": "value"}),
+}
+_TD3 = {
+    "td3": Variant("TD3", TD3),
+    "cchain": Variant("C-CHAIN TD3", CChainTD3),
+    "cchain_value": Variant("C-CHAIN TD3 (values)", CChainTD3, {"churn_target": "value"}),
+}
+_CARTPOLE_DQN: dict[str, Any] = {
+    **{"learning_rate": 2.3e-3, "batch_size": 64, "buffer_size": 100_000, "learning_starts": 1000, "gamma": 0.99},
+    **{"target_update_interval": 10, "train_freq": 256, "gradient_steps": 128},
+    **{"exploration_fraction": 0.16, "exploration_final_eps": 0.04},
+}
+# SB3's SAC and TD3 are CHAIN's otherwise; its buffer of 1e6 holds everything, as this one does
+_CHAIN: dict[str, Any] = {"learning_starts": 5000, "buffer_size": 150_000}
+_CHAIN_TD3: dict[str, Any] = {**_CHAIN, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}}
+
+CASES = {
+    "her_bit_flipping": Case(
+        "Bit flipping with hindsight experience replay, DQN",
+        "SB3's own test of HerReplayBuffer",
+        BitFlippingEnv,
+        _DQN,
+        steps=1500,
+        eval_freq=150,
+        settings={
+            **{"replay_buffer_class": HerReplayBuffer, "learning_rate": 2e-3, "gradient_steps": 2, "learning_starts": 20},
+            **{"train_freq": 1, "exploration_final_eps": 0.02, "target_update_interval": 100, "batch_size": 32},
+            **{"buffer_size": 100_000, "replay_buffer_kwargs": {"n_sampled_goal": 5, "goal_selection_strategy": "future"}},
+        },
+        env_kwargs={"n_bits": 10, "continuous": False},
+        n_envs=2,
+        n_eval_episodes=50,
+        policy="MultiInputPolicy",
+        score="success_rate",
+    ),
+    "dqn_cartpole": Case(
+        "CartPole, DQN",
+        RL_ZOO,
+        "CartPole-v1",
+        _DQN,
+        steps=50_000,
+        eval_freq=2500,
+        settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256]}},
+    ),
+    "dqn_lunar_lander": Case(
+        "LunarLander, DQN",
+        RL_ZOO,
+        "LunarLander-v3",
+        _DQN,
+        steps=100_000,
+        eval_freq=5000,
+        settings={
+            **{"learning_rate": 6.3e-4, "batch_size": 128, "buffer_size": 50_000, "learning_starts": 0, "gamma": 0.99},
+            **{"target_update_interval": 250, "train_freq": 4, "gradient_steps": -1},
+            **{"exploration_fraction": 0.12, "exploration_final_eps": 0.1, "policy_kwargs": {"net_arch": [256, 256]}},
+        },
+    ),
+    "sac_pendulum": Case(
+        "Pendulum, SAC", RL_ZOO, "Pendulum-v1", _SAC, steps=20_000, eval_freq=1000, settings={"learning_rate": 1e-3}
+    ),
+    "td3_pendulum": Case(
+        "Pendulum, TD3",
+        RL_ZOO,
+        "Pendulum-v1",
+        _TD3,
+        steps=20_000,
+        eval_freq=1000,
+        settings={
+            **{"learning_rate": 1e-3, "gamma": 0.98, "buffer_size": 200_000, "learning_starts": 10_000, "train_freq": 1},
+            **{"gradient_steps": 1, "action_noise": _noise(1), "policy_kwargs": {"net_arch": [400, 300]}},
+        },
+    ),
+    "qrdqn_continual_cartpole": Case(
+        "Continual CartPole, QRDQN",
+        "RL Zoo's settings of CartPole",
+        "Continual/CartPole-v1",
+        {"qrdqn": Variant("QRDQN", QRDQN), "cchain": Variant("C-CHAIN QRDQN", CChainQRDQN)},
+        steps=60_000,
+        eval_freq=1500,
+        seeds=3,
+        settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256], "n_quantiles": 10}},
+        env_kwargs={"n_tasks": 4, "steps_per_task": 15_000},
+        n_tasks=4,
+    ),
+    "recurrent_ppo_continual_cartpole": Case(
+        "Continual CartPole, RecurrentPPO",
+        "an LSTM of 64, rollouts of 512 steps, a learning rate of 1e-3, SB3's settings otherwise",
+        "Continual/CartPole-v1",
+        {
+            "recurrent_ppo": Variant("RecurrentPPO", RecurrentPPO),
+            "cchain": Variant("C-CHAIN RecurrentPPO", CChainRecurrentPPO),
+        },
+        steps=90_000,
+        eval_freq=3000,
+        seeds=3,
+        settings={"n_steps": 64, "learning_rate": 1e-3, "policy_kwargs": {"lstm_hidden_size": 64}},
+        env_kwargs={"n_tasks": 3, "steps_per_task": 30_000},
+        n_envs=8,
+        n_tasks=3,
+        policy="MlpLstmPolicy",
+    ),
+    "maskable_ppo_continual_symbols": Case(
+        "Continual symbols with invalid actions, MaskablePPO",
+        "rollouts of 512 steps, a learning rate of 1e-3, SB3's settings otherwise",
+        continual_masked_symbols,
+        {"maskable_ppo": Variant("MaskablePPO", MaskablePPO), "cchain": Variant("C-CHAIN MaskablePPO", CChainMaskablePPO)},
+        steps=120_000,
+        eval_freq=3000,
+        seeds=3,
+        settings={"n_steps": 64, "learning_rate": 1e-3},
+        env_kwargs={"n_tasks": 4, "steps_per_task": 30_000},
+        n_envs=8,
+        n_tasks=4,
+    ),
+    "ppo_cartpole": Case(
+        "CartPole for a long time, PPO",
+        "SB3's settings",
+        "CartPole-v1",
+        {
+            "ppo": Variant("PPO", PPO),
+            "cchain_1e4": Variant("C-CHAIN PPO, β 1e4 (default)", CChainPPO, {"target_churn_ratio": 1e4}),
+            "cchain_1e3": Variant("C-CHAIN PPO, β 1e3", CChainPPO, {"target_churn_ratio": 1e3}),
+        },
+        steps=1_000_000,
+        eval_freq=10_000,
+        solved=475.0,
+    ),
+    # Users report that PPO falls there: https://github.com/DLR-RM/rl-baselines3-zoo/issues/376
+    "ppo_hopper": Case(
+        "Hopper for a long time, PPO",
+        RL_ZOO,
+        "Hopper-v5",
+        {"ppo": Variant("PPO", PPO), "cchain": Variant("C-CHAIN PPO, β 0.05 (default)", CChainPPO)},
+        steps=1_000_000,
+        eval_freq=10_000,
+        seeds=3,
+        settings={
+            **{"batch_size": 32, "n_steps": 512, "gamma": 0.999, "learning_rate": 9.80828e-05, "ent_coef": 0.00229519},
+            **{"clip_range": 0.2, "n_epochs": 5, "gae_lambda": 0.99, "max_grad_norm": 0.7, "vf_coef": 0.835671},
+            "policy_kwargs": {
+                **{"log_std_init": -2, "ortho_init": False, "activation_fn": nn.ReLU},
+                "net_arch": {"pi": [256, 256], "vf": [256, 256]},
+            },
+        },
+        n_eval_episodes=5,
+        normalize=True,
+        solved=1000.0,
+    ),
+    "sac_hopper": Case(
+        "Hopper, SAC", CHAIN, "Hopper-v5", _SAC, steps=150_000, eval_freq=5000, seeds=3, settings=_CHAIN, n_eval_episodes=5
+    ),
+    "td3_hopper": Case(
+        "Hopper, TD3",
+        CHAIN,
+        "Hopper-v5",
+        _TD3,
+        steps=150_000,
+        eval_freq=5000,
+        seeds=3,
+        settings={**_CHAIN_TD3, "action_noise": _noise(3)},
+        n_eval_episodes=5,
+    ),
+    "sac_walker": Case(
+        "Continual Walker, SAC",
+        CHAIN,
+        "Continual/Walker-v0",
+        _SAC,
+        steps=100_000,
+        eval_freq=5000,
+        seeds=3,
+        settings=_CHAIN,
+        env_kwargs={"tasks": ["stand", "walk"], "steps_per_task": 50_000},
+        n_eval_episodes=5,
+        n_tasks=2,
+    ),
+    "td3_walker": Case(
+        "Continual Walker, TD3",
+        CHAIN,
+        "Continual/Walker-v0",
+        _TD3,
+        steps=100_000,
+        eval_freq=5000,
+        seeds=3,
+        settings={**_CHAIN_TD3, "action_noise": _noise(6)},
+        env_kwargs={"tasks": ["stand", "walk"], "steps_per_task": 50_000},
+        n_eval_episodes=5,
+        n_tasks=2,
+    ),
+}

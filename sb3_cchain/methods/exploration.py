@@ -1,0 +1,151 @@
+"""Exploration that begins again at each task: by the exploration rate, the standard deviation or the entropy bonus."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3 import DQN
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import ConstantSchedule
+
+from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.validation import check_number
+
+
+class ExplorationRateRestart(TaskBoundary):
+    """
+    Raises the exploration rate ε of DQN at each task switch, from where it goes down linearly again.
+
+    The first task has the schedule of the model, ``exploration_initial_eps`` and so on. Later tasks have this one, and stay at
+    its end. The step of the last switch is kept as ``model.exploration_restart``.
+
+    :param initial_eps: ε at the beginning of each later task
+    :param final_eps: ε from ``n_steps`` after the switch on; None for the model's ``exploration_final_eps``
+    :param n_steps: Environment steps from the one to the other
+    :raises ValueError: Naming the argument that is out of its range
+    :raises TypeError: When training starts, for an algorithm that is not DQN
+    """
+
+    model: DQN
+
+    def __init__(self, initial_eps: float = 1.0, final_eps: float | None = None, n_steps: int = 10_000):
+        super().__init__()
+        check_number("initial_eps", initial_eps, 0, 1)
+        if final_eps is not None:
+            check_number("final_eps", final_eps, 0, 1)
+        check_number("n_steps", n_steps, 1, integer=True)
+        self.initial_eps = initial_eps
+        self.final_eps = final_eps
+        self.n_steps = n_steps
+
+    def _init_callback(self) -> None:
+        # QR-DQN of sb3-contrib has it, too
+        if not hasattr(self.model, "exploration_schedule"):
+            raise TypeError(f"ExplorationRateRestart is for DQN, got {type(self.model).__name__}")
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        if self.num_timesteps == 0 or not hasattr(self.model, "exploration_restart"):
+            self.model.exploration_restart = None  # type: ignore[attr-defined]
+
+    def _on_task_switch(self) -> None:
+        self.model.exploration_restart = self.num_timesteps  # type: ignore[attr-defined]
+        self.model.exploration_rate = self.initial_eps
+
+    def _on_step(self) -> bool:
+        begin = self.model.exploration_restart  # type: ignore[attr-defined]
+        if begin is not None:
+            final = self.model.exploration_final_eps if self.final_eps is None else self.final_eps
+            rate = _between(self.initial_eps, final, (self.num_timesteps - begin) / self.n_steps)
+            # DQN asks for it at the end of this step
+            self.model.exploration_schedule = ConstantSchedule(rate)
+        return super()._on_step()
+
+
+class LogStdRestart(TaskBoundary):
+    """
+    Sets ``log_std`` of a Gaussian policy back at each task switch, the logarithm of the standard deviation of its actions.
+
+    The means stay. C-CHAIN, where the model has it, forgets its reference batch, so that it does not undo this.
+
+    :param log_std: The value; None for the policy's ``log_std_init``
+    :raises ValueError: When it is not a number
+    :raises TypeError: When training starts, for a policy whose standard deviation is not a parameter (PPO and A2C with ``Box``
+        actions have such a one)
+    """
+
+    model: OnPolicyAlgorithm
+
+    def __init__(self, log_std: float | None = None):
+        super().__init__()
+        if log_std is not None:
+            check_number("log_std", log_std)
+        self.log_std = log_std
+
+    def _init_callback(self) -> None:
+        if not isinstance(getattr(self.model.policy, "log_std", None), th.nn.Parameter):
+            name, space = type(self.model).__name__, self.model.action_space
+            raise TypeError(f"LogStdRestart is for PPO and A2C with Box actions, got {name} with {space}")
+
+    def _on_task_switch(self) -> None:
+        policy: Any = uncompiled(self.model.policy)
+        with th.no_grad():
+            policy.log_std.fill_(policy.log_std_init if self.log_std is None else self.log_std)
+        if self.model.use_sde:
+            policy.reset_noise(self.model.n_envs)
+        for reducer in churn_reducers(self):
+            reducer.forget_reference()
+
+
+class EntropyBonusRestart(TaskBoundary):
+    """
+    Raises ``ent_coef`` of PPO or A2C at each task switch, from where it goes down linearly to the model's own.
+
+    The first task has the model's own. It is kept as ``model.own_ent_coef``, and the step of the last switch as
+    ``model.ent_coef_restart``.
+
+    :param ent_coef: The coefficient at the beginning of each later task
+    :param n_steps: Environment steps until it is the model's own again
+    :raises ValueError: Naming the argument that is out of its range
+    :raises TypeError: When training starts, for an algorithm that is not on-policy
+    """
+
+    model: OnPolicyAlgorithm
+
+    def __init__(self, ent_coef: float = 0.01, n_steps: int = 10_000):
+        super().__init__()
+        check_number("ent_coef", ent_coef, 0)
+        check_number("n_steps", n_steps, 1, integer=True)
+        self.ent_coef = ent_coef
+        self.n_steps = n_steps
+
+    def _init_callback(self) -> None:
+        # TRPO has the argument of its base class and does not use it
+        if not isinstance(self.model, OnPolicyAlgorithm) or type(self.model).__name__.endswith("TRPO"):
+            raise TypeError(f"EntropyBonusRestart is for PPO and A2C, got {type(self.model).__name__}")
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        model: Any = self.model
+        if not hasattr(model, "own_ent_coef"):
+            model.own_ent_coef = model.ent_coef
+        if self.num_timesteps == 0 or not hasattr(model, "ent_coef_restart"):
+            model.ent_coef_restart = None
+
+    def _on_task_switch(self) -> None:
+        self.model.ent_coef_restart = self.num_timesteps  # type: ignore[attr-defined]
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        model: Any = self.model
+        if model.ent_coef_restart is not None:
+            share = (self.num_timesteps - model.ent_coef_restart) / self.n_steps
+            model.ent_coef = _between(self.ent_coef, model.own_ent_coef, share)
+
+    def _on_training_end(self) -> None:
+        self.model.ent_coef = self.model.own_ent_coef  # type: ignore[attr-defined]
+
+
+def _between(initial: float, final: float, share: float) -> float:
+    return initial + (final - initial) * min(share, 1.0)

@@ -1,0 +1,40 @@
+"""What a callback that follows the tasks checks when training starts."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_single
+from sb3_cchain.tasks.signal import active_signal, episode_task, require_continual
+from sb3_cchain.tasks.sync import warn_without_sync
+from sb3_cchain.tasks.task_signal import TaskSignal
+
+
+def start_listening(callback: BaseCallback, needs_switches: bool = True) -> None:
+    """
+    :param callback: A callback that follows the tasks, when training starts
+    :param needs_switches: Whether it is of no use where the task cannot switch
+    :raises TypeError: With ``needs_switches``, when there cannot be a switch: there is no :class:`~sb3_cchain.TaskSignal`, the
+        environment is not continual, and this call of ``learn()`` begins training anew
+    :raises ValueError: When ``learn()`` was given several callbacks of its class, or a TaskSignal behind it
+    """
+    given = list(iterate_callbacks(callback.locals.get("callback")))
+    has_signal = any(isinstance(other, TaskSignal) for other in given)
+    if needs_switches and not has_signal:
+        _require_tasks(callback)
+    require_single(callback)
+    warn_without_sync(callback)
+    if has_signal and active_signal(callback.training_env) is None:
+        name = type(callback).__name__
+        raise ValueError(f"TaskSignal must come before {name}, which hears of switches from it: give it to `learn()` first")
+    episode_task(callback.model)  # counts from now on
+
+
+def _require_tasks(callback: BaseCallback) -> None:
+    if callback.locals.get("reset_num_timesteps", True):
+        try:
+            require_continual(callback)
+        except TypeError as error:
+            raise TypeError(
+                f"{error} Or say when the world changes, by a sb3_cchain.TaskSignal before it. Or train in one environment "
+                "after the other, each given by `model.set_env()` and trained in by `model.learn(..., "
+                "reset_num_timesteps=False)`."
+            ) from None

@@ -1,0 +1,202 @@
+"""The command ``benchmarks.family``: its runs, and its tables of results written by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sb3_contrib.common.maskable.utils import get_action_masks
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.family import __main__ as command
+from benchmarks.family import training
+from benchmarks.family.cases import CASES, Case, Variant
+from benchmarks.family.masked_symbols import continual_masked_symbols
+from benchmarks.family.tables import case_table, falls, falls_table, number, read_all, summary_table
+from benchmarks.family.training import runs_of, train, train_all
+from sb3_cchain import CChainPPO, resume
+
+# Two tasks of 20 steps, four evaluations of each: the last of each task is its end
+SMALL = Case(
+    "Continual CartPole",
+    "made up",
+    "Continual/CartPole-v1",
+    {"ppo": Variant("PPO", PPO), "cchain": Variant("C-CHAIN", CChainPPO, {"target_churn_ratio": 1e3})},
+    steps=40,
+    eval_freq=5,
+    seeds=2,
+    settings={"n_steps": 4, "batch_size": 2, "policy_kwargs": {"net_arch": [4]}},
+    env_kwargs={"n_tasks": 2, "steps_per_task": 20},
+    n_eval_episodes=1,
+    n_tasks=2,
+)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr("benchmarks.family.cases.CASES", {"small": SMALL})
+    for module in (training, command):
+        monkeypatch.setattr(module, "CASES", {"small": SMALL})
+
+
+@pytest.fixture
+def runs(small, tmp_path):
+    """Of both variants, seed by seed."""
+    return runs_of("small", tmp_path / "results", tmp_path / "logs")
+
+
+def write(run, scores, column="mean_return"):
+    run.result.parent.mkdir(parents=True, exist_ok=True)
+    lines = [f"{5 * (i + 1)},{score}" for i, score in enumerate(scores)]
+    run.result.write_text("\n".join([f"timesteps,{column}", *lines]) + "\n")
+
+
+def rows(table):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if line.startswith("|")]
+
+
+def test_a_table_of_the_seeds(runs):
+    for run, last in zip(runs, [10.0, 30.0, 20.0], strict=False):
+        write(run, [0, 0, 0, 200, 0, 0, 0, last])
+    table = case_table(SMALL, read_all(runs))
+    # (200 + 10) / 8 and (200 + 20) / 8 over training; (200 + 10) / 2 and (200 + 20) / 2 at the end
+    assert rows(table)[2:] == [["PPO", "26.2, 27.5", "26.9", "105, 110", "108"], ["C-CHAIN", "28.8", "28.8", "115", "115"]]
+    assert table.endswith("Seeds that are not done yet: C-CHAIN: 1.")
+    write(runs[3], [0] * 8)
+    assert "not done" not in case_table(SMALL, read_all(runs))
+
+
+def test_a_difference_is_bold_when_its_interval_leaves_out_0(runs):
+    base = [(0.0, 100.0), (2.0, 102.0)]
+    for seed, (low, high) in enumerate(base):
+        write(runs[2 * seed], [low] * 8)
+        write(runs[2 * seed + 1], [high] * 8)
+    ((*_, means, difference, _, _),) = rows(summary_table({"small": (SMALL, read_all(runs))}))[2:]
+    # Welch: each mean has the standard error 1, their difference sqrt(2), with 2 degrees of freedom: 4.303 * sqrt(2) = 6.08
+    assert (means, difference) == ("1.00 → 101", "**100 (93.9 to 106)**")
+    write(runs[1], [0.0] * 8)
+    write(runs[3], [4.0] * 8)
+    ((*_, difference, _, _),) = rows(summary_table({"small": (SMALL, read_all(runs))}))[2:]
+    assert difference.startswith("1.00 (-") and " to " in difference
+
+
+def test_tables_without_runs(runs):
+    evaluations = read_all(runs)
+    assert summary_table({"small": (SMALL, evaluations)}).endswith("Not done yet: Continual CartPole (C-CHAIN).")
+    assert case_table(SMALL, evaluations) == falls_table(replace(SMALL, solved=475), evaluations) == "No run is done yet."
+
+
+def test_falls():
+    evaluations = np.array([[1, 0.0], [2, 10.0], [3, 4.0], [4, 6.0], [5, 10.0]])
+    assert falls(evaluations, solved=10, worst=0) == (2.0, 4.0, 0.25)
+    assert falls(evaluations, solved=10, worst=4) == (2.0, 4.0, 0.5)
+    assert falls(evaluations, solved=11, worst=0) is None
+
+
+def test_a_table_of_falls(runs):
+    write(runs[0], [0, 475, 500, 100, 100, 500, 500, 500])
+    write(runs[1], [0] * 8)
+    table = falls_table(replace(SMALL, solved=475), read_all(runs))
+    assert rows(table)[2:] == [
+        ["PPO", "0", "10", "100", "29%", "500", "334"],
+        ["C-CHAIN", "0", "never", "", "", "0.00", "0.00"],
+    ]
+    assert table.endswith("Seeds that are not done yet: PPO: 1; C-CHAIN: 1.")
+
+
+@pytest.mark.parametrize("value, text", [(-181.3, "-181"), (1234.5, "1234"), (23.45, "23.4"), (0.984, "0.98")])
+def test_numbers(value, text):
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    "scores, column, message",
+    [
+        ([1.0] * 7, "mean_return", "must have 8 evaluations"),
+        ([1.0] * 8, "success_rate", "must have the columns timesteps and"),
+    ],
+)
+def test_a_result_of_another_case_is_refused(runs, scores, column, message):
+    write(runs[0], scores, column)
+    with pytest.raises(ValueError, match=message):
+        read_all(runs)
+
+
+def test_a_run_goes_on_where_it_was(runs, monkeypatch):
+    run = runs[1]
+    expected = train(run).result.read_text()
+    assert expected.splitlines()[0] == "timesteps,mean_return" and len(expected.splitlines()) == 9
+    assert not run.checkpoints.exists()
+    run.result.unlink()
+
+    def break_off(*args):
+        raise KeyboardInterrupt
+
+    resumed = []
+    with monkeypatch.context() as context:
+        context.setattr(training, "_write", break_off)
+        with pytest.raises(KeyboardInterrupt):
+            train(run)
+    with monkeypatch.context() as context:
+        context.setattr(training, "resume", lambda path, *args, **kw: resumed.append(path) or resume(path, *args, **kw))
+        assert train(run).result.read_text() == expected
+    assert resumed == [run.checkpoints] and not run.checkpoints.exists()
+
+
+def test_runs_that_are_done_are_not_made_again(runs):
+    for run in runs:
+        write(run, [0] * 8)
+    assert list(train_all(runs, 1)) == []
+
+
+def test_the_command(runs, tmp_path, capsys):
+    arguments = ["--results", str(tmp_path / "results"), "--logs", str(tmp_path / "logs"), "--docs", str(tmp_path / "docs")]
+    write(runs[0], [0] * 8)
+    command.main(["--case", "small", "--variant", "ppo", "--seeds", "0", "1", *arguments])
+    shown = capsys.readouterr().out
+    assert "small/ppo_seed_1: done" in shown and "ppo_seed_0" not in shown and "not done yet: C-CHAIN: 0, 1." in shown
+    page = tmp_path / "docs" / "page.md"
+    page.parent.mkdir()
+    page.write_text("".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in ("family_small", "family_evidence")))
+    command.main(["--write", *arguments])
+    assert "small" in (shown := capsys.readouterr().out) and " 2 of  4 runs" in shown
+    assert "| PPO | " in page.read_text() and "Not done yet: Continual CartPole (C-CHAIN)." in page.read_text()
+    assert (tmp_path / "docs/images/family/small.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--case", "nonsense"], "invalid choice: 'nonsense'"),
+        (["--case", "ppo_cartpole", "--variant", "sac"], "must be of the cases: ppo, cchain_1e4, cchain_1e3; got sac"),
+        (["--case", "ppo_cartpole", "--seeds", "9"], "must be of the cases: 0, 1, 2, 3, 4; got 9"),
+    ],
+)
+def test_what_is_unknown_is_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit) as error:
+        command.main(arguments)
+    assert error.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_evaluations_divide_a_case(name):
+    case = CASES[name]
+    assert case.eval_freq % case.n_envs == 0 and case.steps % case.eval_freq == 0
+    assert case.steps // case.eval_freq % case.n_tasks == 0
+    if "steps_per_task" in case.env_kwargs:
+        assert case.env_kwargs["steps_per_task"] * case.n_tasks == case.steps
+    base, *others = case.variants
+    assert not base.startswith("cchain") and any(name.startswith("cchain") for name in others)
+
+
+def test_masks_of_the_present_task():
+    env = make_vec_env(lambda: continual_masked_symbols(n_tasks=2, steps_per_task=60, n_symbols=6), seed=0)
+    first, second = (task.answers for task in env.get_attr("tasks")[0])
+    assert first != second
+    (symbol,) = env.reset()
+    for step in range(120):
+        answers = first if step < 60 else second
+        (mask,) = get_action_masks(env)
+        assert mask[answers[symbol]] and mask.sum() == 3
+        (symbol,), (reward,), _, _ = env.step([answers[symbol]])
+        assert reward == 1

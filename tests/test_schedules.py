@@ -1,0 +1,159 @@
+"""Schedules that go on from one call of learn() to the next."""
+
+import warnings
+
+import pytest
+import torch as th
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_cchain import CChainPPO, DoubleDQN, TaskSignal, TrainingCheckpoint, resume
+from sb3_cchain.callbacks import OverallSchedule, TaskSchedule
+from tests.envs import CountEnv
+from tests.method_models import OFF_POLICY, ON_POLICY
+
+LINEAR = LinearSchedule(1e-3, 0.0, 1.0)
+
+
+def make(cls, **kwargs):
+    settings = ON_POLICY if issubclass(cls, PPO) else OFF_POLICY
+    env = "Pendulum-v1" if cls is SAC else CountEnv()
+    settings = {**settings, "policy_kwargs": dict(net_arch=[8])}  # of its own: SAC writes into it
+    return cls("MlpPolicy", env, **{"seed": 0, "device": "cpu", "learning_rate": LINEAR, **settings, **kwargs})
+
+
+class Rates(BaseCallback):
+    """The learning rate of each train(), by the step after which it was made."""
+
+    def __init__(self):
+        super().__init__()
+        self.rates = {}
+
+    def _on_rollout_start(self):
+        self._look()
+
+    def _on_training_end(self):
+        self._look()
+
+    def _look(self):
+        if self.model._n_updates > 0:
+            self.rates[self.num_timesteps] = self.model.policy.optimizer.param_groups[0]["lr"]
+
+    def _on_step(self):
+        return True
+
+
+def rates_of(model, callback, chunks):
+    rates = Rates()
+    for steps in chunks:
+        model.learn(steps, callback=[callback, rates], reset_num_timesteps=False)
+    return rates.rates
+
+
+@pytest.mark.parametrize("cls", [PPO, CChainPPO, DQN, SAC])
+def test_chunks_are_equal_to_one_training(cls):
+    whole = make(cls).learn(64)
+    parts = make(cls)
+    for steps in (32, 16, 16):
+        parts.learn(steps, callback=OverallSchedule(64), reset_num_timesteps=False)
+    for one, other in zip(whole.policy.parameters(), parts.policy.parameters(), strict=True):
+        assert th.equal(one, other)
+    assert whole._current_progress_remaining == parts._current_progress_remaining == 0
+    assert getattr(whole, "exploration_rate", 0) == getattr(parts, "exploration_rate", 0)
+
+
+def test_the_rates_of_chunks():
+    """By hand: 1e-3 times the share of 64 steps that remains."""
+    assert rates_of(make(PPO), OverallSchedule(64), [32, 32]) == pytest.approx({16: 7.5e-4, 32: 5e-4, 48: 2.5e-4, 64: 0})
+
+
+@pytest.mark.parametrize("chunks", [[96], [32, 64], [48, 48]])
+def test_each_task_begins_its_schedule_again(chunks):
+    model, rates = make(PPO), Rates()
+    for steps in chunks:
+        callbacks = [TaskSignal(switch_at=[48]), TaskSchedule(32), rates]
+        model.learn(steps, callback=callbacks, reset_num_timesteps=False)
+    # The first task lasts for 48 steps, of which the last 16 are after the end of the schedule
+    assert rates.rates == pytest.approx({16: 5e-4, 32: 0, 48: 0, 64: 5e-4, 80: 0, 96: 0})
+
+
+def test_exploration_begins_again_with_the_task():
+    model, rates = make(DQN, exploration_fraction=0.5), []
+
+    class Spy(BaseCallback):
+        def _on_step(self):
+            rates.append(self.model.exploration_rate)
+            return True
+
+    model.learn(42, [TaskSignal(switch_every=40), TaskSchedule(40), Spy()])
+    assert rates[11] == pytest.approx(1 - 0.95 * 11 / 20) and rates[39] == 0.05
+    assert rates[41] == pytest.approx(1 - 0.95 * 1 / 20)
+
+
+@pytest.mark.parametrize("cls", [PPO, DQN])
+def test_saved_in_the_middle_and_loaded(tmp_path, cls):
+    model = make(cls)
+
+    class Save(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 32:
+                self.model.save(tmp_path / "model")
+            return True
+
+    model.learn(48, [OverallSchedule(96), Save()])
+    assert "_update_current_progress_remaining" not in vars(model) and "_excluded_save_params" not in vars(model)
+    loaded = cls.load(tmp_path / "model", env=CountEnv(), device="cpu")
+    assert "_update_current_progress_remaining" not in vars(loaded) and "_excluded_save_params" not in vars(loaded)
+    loaded.learn(16, OverallSchedule(96), reset_num_timesteps=False)
+    assert loaded._current_progress_remaining == 0.5
+
+
+@pytest.mark.parametrize("make_schedule", [lambda: OverallSchedule(128), lambda: TaskSchedule(24)])
+def test_resumed_exactly(tmp_path, make_schedule):
+    def callbacks(folder):
+        return [TaskSignal(switch_at=[16]), make_schedule(), TrainingCheckpoint(32, folder, keep=9)]
+
+    whole = make(PPO).learn(64, callbacks(tmp_path / "whole"))
+    (checkpoint,) = (tmp_path / "whole").glob("step_*32")
+    resumed = resume(checkpoint, CountEnv(), callbacks(tmp_path / "resumed"), device="cpu")
+    assert resumed.num_timesteps == 64 and resumed._current_progress_remaining == whole._current_progress_remaining
+    for one, other in zip(whole.policy.parameters(), resumed.policy.parameters(), strict=True):
+        assert th.equal(one, other)
+
+
+def test_an_interrupted_training_leaves_nothing():
+    class Stop(BaseCallback):
+        def _on_step(self):
+            raise KeyboardInterrupt
+
+    model = make(PPO)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(32, [OverallSchedule(1000), Stop()])
+    model.learn(32)
+    assert model._current_progress_remaining == 0 and "_update_current_progress_remaining" not in vars(model)
+
+
+def test_training_beyond_the_end_is_warned_of():
+    model = make(PPO)
+    with pytest.warns(UserWarning, match=r"trains up to step 48, but OverallSchedule has `total_timesteps=32`"):
+        assert rates_of(model, OverallSchedule(32), [48])[48] == 0
+
+
+@pytest.mark.parametrize("value", [0, -1, 1.5, "1e6", None])
+def test_bad_lengths(value):
+    for cls, name in ((OverallSchedule, "total_timesteps"), (TaskSchedule, "steps_per_task")):
+        with pytest.raises(ValueError, match=f"`{name}` must be an integer greater than or equal to 1, got {value!r}"):
+            cls(value)
+
+
+@pytest.mark.parametrize("cls", [CChainPPO, DoubleDQN])
+def test_a_schedule_that_is_at_0_too_early_warns_once(cls):
+    schedule = LinearSchedule(1e-3, 0.0, 0.25)
+    model = make(cls, learning_rate=schedule)
+    with pytest.warns(UserWarning, match="learning rate is 0 from step 32 on") as caught:
+        model.learn(128)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(cls).learn(64, OverallSchedule(64))

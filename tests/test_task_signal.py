@@ -1,0 +1,482 @@
+"""Where the signal of a task switch comes from, and that everything hears of it."""
+
+import builtins
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
+from sb3_cchain.analysis.inspection import inspect_model
+from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
+from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart, Oracle, ShrinkAndPerturb
+from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
+from sb3_cchain.tasks import TaskBoundary
+from sb3_cchain.tasks.task_signal import _equal
+from tests.envs import CountEnv
+from tests.method_models import make_callback, make_env, make_model, optimizer_arguments
+
+SWITCH = 32
+
+
+class World(CountEnv):
+    """Episodes of two steps. After ``change_at`` steps it has another level and other rewards, and says so in its info."""
+
+    difficulty = 1
+
+    def __init__(self, change_at=SWITCH):
+        super().__init__(length=2)
+        self.change_at, self.n_steps_so_far, self.level = change_at, 0, "easy"
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0], {"level": self.level}
+
+    def step(self, action):
+        info = {"level": self.level}
+        self.n_steps_so_far += 1
+        result = super().step(action)[:4]
+        if self.n_steps_so_far == self.change_at:
+            self.level, self.task_reward = "hard", -5.0
+        return *result, info
+
+
+class Curriculum(BaseCallback):
+    """Calls a function at one environment step."""
+
+    def __init__(self, function, at=SWITCH):
+        super().__init__()
+        self.function, self.at = function, at
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            self.function(self)
+        return True
+
+
+def say(callback):
+    task_switched(callback.model)
+
+
+def make_harder(callback):
+    callback.training_env.env_method("__setattr__", "difficulty", 2)
+
+
+# Each source, and the callbacks that go before it
+SOURCES = {
+    "info": ([], dict(key="level")),
+    "attribute": ([], dict(attribute="level")),
+    "env_method": ([lambda: Curriculum(make_harder)], dict(attribute="difficulty")),
+    "switch_every": ([], dict(switch_every=SWITCH)),
+    "switch_at": ([], dict(switch_at=[SWITCH])),
+    "task_switched": ([lambda: Curriculum(say)], {}),
+    "drift": ([], dict(drift="adwin")),
+    "set_env": ([], {}),
+}
+# With 16 episodes before the switch, the detector hears of it after 13 more, of two steps
+DELAY = {"drift": 26}
+# Up to here there is one switch
+N_STEPS = 2 * SWITCH - 4
+
+
+def signals(source):
+    before, arguments = SOURCES[source]
+    return [*(make() for make in before), TaskSignal(**arguments)]
+
+
+def train(model, source, callbacks):
+    """One training, in which the task switches once."""
+    n_steps = N_STEPS + DELAY.get(source, 0)
+    if source != "set_env":
+        return model.learn(n_steps, callback=[*signals(source), *callbacks], log_interval=None)
+    other = model.env.envs[0].unwrapped.__class__()
+    for world, steps in ((model.env, SWITCH), (other, n_steps - SWITCH)):
+        model.set_env(world)
+        model.learn(steps, [*signals(source), *callbacks], log_interval=None, reset_num_timesteps=False)
+    return model
+
+
+by_source = pytest.mark.parametrize("source", SOURCES)
+
+
+@by_source
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN", "CChainPPO"])
+def test_returns_are_those_of_the_tasks(tmp_path, algorithm, source):
+    path = tmp_path / "returns.csv"
+    model = make_model(algorithm, World())
+    train(model, source, [ContinualMetrics(path)])
+    rows = read_returns(path)
+    assert list(dict.fromkeys(row["task_id"] for row in rows)) == [0, 1]
+    begins = SWITCH + DELAY.get(source, 0)
+    assert sum(row["n_episodes"] for row in rows if row["task_id"] == 0) == begins / 2
+    assert model.continual_state["n_switches"] == 1
+    assert {"continual/task_id", "continual/average_task_1"} <= model.logger.name_to_value.keys()
+
+
+def count_calls(owner, name):
+    """:return: A list that grows by one at each call of a method"""
+    calls, method = [], getattr(owner, name)
+
+    def call(*args, **kwargs):
+        calls.append(True)
+        return method(*args, **kwargs)
+
+    setattr(owner, name, call)
+    return calls
+
+
+def boundary(make):
+    def listener(algorithm):
+        callback = make()
+        return make_model(algorithm, World()), [callback], count_calls(callback, "_on_task_switch")
+
+    return listener
+
+
+def gaussian(algorithm):
+    class Continuous(World):
+        action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    callback = LogStdRestart()
+    return make_model("PPO", Continuous()), [callback], count_calls(callback, "_on_task_switch")
+
+
+def coefficient_of_the_model(algorithm):
+    model = make_model(f"CChain{algorithm}", World(), reset_churn_coef=True)
+    return model, [], count_calls(model.churn_reducer.coefficient, "reset")
+
+
+def coefficient_of_the_callback(algorithm):
+    callback, calls = CChainCallback(reset_churn_coef=True), []
+    on_start = callback._on_training_start
+
+    def on_training_start():
+        on_start()
+        method = callback.churn_reducer.coefficient.reset
+        callback.churn_reducer.coefficient.reset = lambda: (calls.append(True), method())
+
+    callback._on_training_start = on_training_start
+    return make_model(algorithm, World()), [callback], calls
+
+
+def normalization(algorithm):
+    env = TaskVecNormalize(make_vec_env(World))
+    return make_model(algorithm, env), [], count_calls(env, "_restart")
+
+
+def learning_starts(algorithm):
+    callback = TaskLearningStarts(4)
+    model = make_model("DQN", World())
+
+    class Calls:
+        def __len__(self):
+            return [4, SWITCH + 4].index(model.learning_starts)
+
+    return model, [callback], Calls()
+
+
+LISTENERS = {
+    "Oracle": boundary(Oracle),
+    "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
+    "ExplorationRateRestart": boundary(ExplorationRateRestart),
+    "EntropyBonusRestart": boundary(EntropyBonusRestart),
+    "LogStdRestart": gaussian,
+    "TaskSchedule": boundary(lambda: TaskSchedule(SWITCH)),
+    "TaskLearningStarts": learning_starts,
+    "CChain": coefficient_of_the_model,
+    "CChainCallback": coefficient_of_the_callback,
+    "TaskVecNormalize": normalization,
+}
+# Oracle with both algorithms, the others in turn
+WITH_DQN = {"Oracle", "ShrinkAndPerturb", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
+WITH_PPO = LISTENERS.keys() - WITH_DQN | {"Oracle"}
+
+
+@by_source
+@pytest.mark.parametrize("algorithm, name", [*(("PPO", n) for n in sorted(WITH_PPO)), *(("DQN", n) for n in sorted(WITH_DQN))])
+def test_every_listener_hears_every_source(algorithm, name, source):
+    if name == "TaskLearningStarts" and source == "drift":
+        pytest.skip("the switch is heard at another step")
+    if name == "TaskVecNormalize" and source == "set_env":
+        pytest.skip("another environment has normalisation of its own")
+    model, callbacks, calls = LISTENERS[name](algorithm)
+    train(model, source, callbacks)
+    assert len(calls) == 1
+
+
+def test_every_boundary_is_a_listener_here():
+    classes = {cls.__name__ for cls in TaskBoundary.__subclasses__() if cls.__module__.startswith("sb3_cchain.")}
+    assert classes <= LISTENERS.keys() and {"Oracle", "TaskSchedule"} <= classes
+
+
+@pytest.mark.parametrize("method", [m for m in REGISTRY if m.page != FAMILY_PAGE], ids=lambda method: method.algo)
+def test_every_method_trains_with_a_signal(method):
+    policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
+    if method.optimizer_class is not None:
+        policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
+    model = make_model(method.algorithm.__name__, World(), policy=method.policy, policy_kwargs=policy_kwargs)
+    callbacks = [make_callback(cls) for cls in method.callbacks]
+    model.learn(SWITCH + 16, [TaskSignal(switch_at=[SWITCH]), *callbacks, ContinualMetrics()])
+    assert model.continual_state["n_switches"] == 1
+
+
+def test_c_chain_adds_the_metrics_by_itself():
+    for callback, is_logged in ((None, False), (TaskSignal(switch_every=16), True)):
+        model = make_model("CChainPPO", CountEnv()).learn(48, callback=callback, log_interval=None)
+        assert ("continual/n_switches" in model.logger.name_to_value) == is_logged
+    assert model.logger.name_to_value["continual/n_switches"] == 2
+
+
+def test_a_continual_environment_is_heard_as_without_a_signal():
+    rows = []
+    for callbacks in ([], [TaskSignal()]):
+        metrics = ContinualMetrics()
+        make_model("CChainPPO").learn(96, [*callbacks, metrics])
+        rows.append(metrics.rows)
+    assert rows[0] == rows[1] and {row["task_id"] for row in rows[0]} == {0, 1, 2}
+
+
+def test_a_source_takes_the_place_of_the_environments_numbers():
+    oracle = Oracle()
+    model = make_model("CChainPPO").learn(96, [TaskSignal(switch_at=[16]), oracle])
+    assert oracle.n_resets == model.continual_state["n_switches"] == 1
+
+
+def test_without_a_signal_the_user_is_heard():
+    oracle, metrics = Oracle(), ContinualMetrics()
+    model = make_model("PPO", CountEnv())
+    model.learn(32, metrics)
+    task_switched(model)
+    model.learn(32, [metrics, oracle], reset_num_timesteps=False)
+    assert model.continual_state["n_switches"] == 1
+    model.learn(32, [metrics], reset_num_timesteps=False)
+    assert model.continual_state["n_switches"] == 1
+    model.learn(32, metrics)
+    assert {row["task_id"] for row in metrics.rows} == {0}
+
+
+def test_the_user_does_not_contradict_the_environment():
+    model = make_model("PPO").learn(16)
+    with pytest.raises(ValueError, match=r"where the environment numbers its tasks itself, in info\['task_id'\]"):
+        task_switched(model)
+
+
+def test_two_reports_at_a_step_are_one_switch():
+    """The call, another environment, and an attribute that differs there."""
+    worlds, metrics = [World(), World()], ContinualMetrics()
+    worlds[1].difficulty = 2
+    model = make_model("PPO", worlds[0])
+    signal = TaskSignal(attribute="difficulty")
+    model.learn(16, [signal, metrics])
+    task_switched(model)
+    model.set_env(worlds[1])
+    model.learn(16, [signal, metrics], reset_num_timesteps=False)
+    assert model.continual_state["n_switches"] == 2 - 1
+
+
+def test_a_world_that_comes_back_is_a_new_task():
+    class Cycle(World):
+        def step(self, action):
+            result = super().step(action)
+            self.level = "hard" if 16 <= self.n_steps_so_far < 32 else "easy"
+            return result
+
+    metrics = ContinualMetrics()
+    make_model("PPO", Cycle(10**9)).learn(48, [TaskSignal(attribute="level"), metrics])
+    assert list(dict.fromkeys(row["task_id"] for row in metrics.rows)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))])
+def test_environments_side_by_side(kwargs):
+    oracle = Oracle()
+    env = make_vec_env(World, 2, **kwargs)
+    make_model("PPO", env, n_steps=8).learn(96, [TaskSignal(attribute="level"), oracle])
+    env.close()
+    assert oracle.n_resets == 1
+
+
+def test_a_switch_in_the_middle_of_an_episode_is_heard_at_the_next_rollout():
+    oracle, heard = Oracle(), []
+    model = make_model("DQN", CountEnv(length=10**6))
+    oracle._on_task_switch = lambda: heard.append(model.num_timesteps)
+    model.learn(40, [TaskSignal(switch_at=[17, 30]), oracle])
+    assert heard == [17, 30]
+
+
+def test_an_interrupted_signal_is_silent_in_the_next_training():
+    def stop(callback):
+        raise KeyboardInterrupt
+
+    model, metrics = make_model("PPO"), ContinualMetrics()
+    signal = TaskSignal(switch_at=[8])
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(32, [signal, Curriculum(stop, 20)])
+    model.learn(96, metrics)
+    assert {row["task_id"] for row in metrics.rows} == {0, 1, 2}
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_a_saved_model_goes_on_counting(tmp_path, algorithm):
+    model = make_model(algorithm, World())
+    model.learn(SWITCH + 8, [TaskSignal(attribute="level"), ContinualMetrics()]).save(tmp_path / "model")
+    world = World()
+    loaded = type(model).load(tmp_path / "model", env=world, device="cpu")
+    # Its level is the first one again, which is another one than the last
+    loaded.learn(16, [TaskSignal(attribute="level"), ContinualMetrics()], reset_num_timesteps=False)
+    assert loaded.continual_state["n_switches"] == 2 and loaded.continual_state["task_id"] == 2
+
+
+@pytest.mark.parametrize("arguments", [dict(drift="adwin"), dict(attribute="level"), dict(switch_every=20)])
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_resumed_exactly(tmp_path, algorithm, arguments):
+    """Saved a little before the switch is heard, training goes on to the same switch."""
+
+    def callbacks(folder):
+        return [TaskSignal(**arguments), ContinualMetrics(), Oracle(), TrainingCheckpoint(16, folder, keep=10)]
+
+    make_model(algorithm, World()).learn(64, whole := callbacks(tmp_path / "whole"))
+    (checkpoint,) = (tmp_path / "whole").glob("step_*16")
+    resume(checkpoint, World(), resumed := callbacks(tmp_path / "resumed"))
+    assert resumed[1].rows == whole[1].rows
+    assert {row["task_id"] for row in whole[1].rows} > {0}
+
+
+def test_drift_of_a_logged_value():
+    """Value error and churn are what the algorithm logs."""
+    model, heard, signal = make_model("PPO", CountEnv()), [], TaskSignal(drift="adwin", drift_of="train/value_loss")
+    signal._detector = SimpleNamespace(update=lambda value: heard.append(value) or len(heard) == 3, reset=lambda: None)
+    losses = []
+
+    class Spy(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            losses.append(self.logger.name_to_value.get("train/value_loss"))
+
+    model.learn(80, [signal, Spy()])
+    assert heard == losses[1:] and len(heard) == 4
+    assert signal.next_task == 1
+
+
+def test_river_is_asked_for(monkeypatch):
+    original = builtins.__import__
+
+    def without_river(name, *args, **kwargs):
+        if name.startswith("river"):
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_river)
+    with pytest.raises(ImportError, match=r'pip install "sb3-cchain\[drift\]"'):
+        TaskSignal(drift="adwin")
+
+
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        (
+            dict(attribute="level", switch_every=3),
+            ValueError,
+            "one source, got attribute='level', switch_every=3: give one of",
+        ),
+        (dict(switch_every=3, switch_at=[3]), ValueError, "one source"),
+        (dict(drift="adwin", key="level"), ValueError, "one source"),
+        (dict(key=3), TypeError, "`key` must be a string, got 3"),
+        (dict(attribute=["level"]), TypeError, r"`attribute` must be a string, got \['level'\]"),
+        (dict(switch_every=0), ValueError, "`switch_every` must be an integer greater than or equal to 1, got 0"),
+        (dict(switch_at=[]), ValueError, "`switch_at` must name at least one"),
+        (dict(switch_at=7), TypeError, "`switch_at` must be a list of environment steps, got 7"),
+        (dict(switch_at=[0]), ValueError, r"`switch_at\[0\]` must be an integer greater than or equal to 1, got 0"),
+        (dict(switch_at=[5, 5]), ValueError, r"`switch_at\[1\]` must be an integer greater than or equal to 6, got 5"),
+        (dict(drift="page"), ValueError, "`drift` must be one of 'adwin', got 'page'"),
+        (dict(drift="adwin", drift_delta=0), ValueError, "`drift_delta` must be a number between 0 and 1, got 0"),
+    ],
+)
+def test_bad_arguments(arguments, error, message):
+    with pytest.raises(error, match=message):
+        TaskSignal(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        (dict(key="lvl"), ValueError, r"the environment's info must have 'lvl', but it has .*'level'"),
+        (dict(attribute="lvl"), ValueError, "`attribute` must be one of the environment or of a wrapper, but none has 'lvl'"),
+    ],
+)
+def test_a_source_that_is_not_there(arguments, error, message):
+    with pytest.raises(error, match=message):
+        make_model("PPO", World()).learn(16, TaskSignal(**arguments))
+
+
+def test_returns_need_a_monitor():
+    model = make_model("PPO", make_vec_env(World))
+    model.set_env(model.env.__class__([World]))  # nobody records episodes
+    with pytest.raises(ValueError, match=r"wrap it in stable_baselines3.common.monitor.Monitor"):
+        model.learn(16, TaskSignal(drift="adwin"))
+
+
+@pytest.mark.parametrize("make, algorithm", [(Oracle, "PPO"), (ContinualMetrics, "PPO"), (TaskLearningStarts, "DQN")])
+def test_the_signal_comes_first(make, algorithm):
+    with pytest.raises(ValueError, match=f"TaskSignal must come before {make.__name__}"):
+        make_model(algorithm, CountEnv()).learn(16, [make(), TaskSignal()])
+
+
+def test_another_environment_in_a_training_that_begins_anew_is_warned_of():
+    model = make_model("PPO", CountEnv()).learn(16, TaskSignal())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(16, TaskSignal())
+    model.set_env(CountEnv())
+    with pytest.warns(UserWarning, match=r"`set_env\(\)` gave another environment, but .* reset_num_timesteps=False"):
+        model.learn(16, TaskSignal())
+
+
+def test_a_model_that_has_heard_a_signal_is_inspected():
+    model = make_model("PPO", World()).learn(16, [TaskSignal(attribute="level"), oracle := Oracle()])
+    inspection = inspect_model(model, callbacks=[TaskSignal(attribute="level"), oracle])
+    assert inspection.figures["rollout/n_steps"] == 16 and oracle.n_resets == 0
+    model.env.set_attr("level", "hard")
+    inspect_model(model, callbacks=[TaskSignal(attribute="level"), oracle])
+    assert oracle.n_resets == 1
+
+
+def test_from_yaml():
+    """As the stock RL Zoo reads ``callback:``."""
+    entries = [{"sb3_cchain.TaskSignal": {"switch_at": [16]}}, "sb3_cchain.ContinualMetrics", "sb3_cchain.methods.Oracle"]
+    callbacks = pytest.importorskip("rl_zoo3.utils").get_callback_list({"callback": entries})
+    make_model("PPO", CountEnv()).learn(32, callbacks)
+    assert callbacks[2].n_resets == 1
+
+
+def test_one_signal_is_enough():
+    with pytest.raises(ValueError, match="2 callbacks TaskSignal"):
+        make_model("PPO", CountEnv()).learn(16, [TaskSignal(), TaskSignal(switch_every=3)])
+
+
+@pytest.mark.parametrize("cls", [PPO, DQN])
+def test_without_a_signal_a_method_still_asks_for_tasks(cls):
+    with pytest.raises(TypeError, match=r"say when the world changes, by a sb3_cchain.TaskSignal"):
+        make_model(cls.__name__, CountEnv()).learn(16, Oracle())
+
+
+@pytest.mark.parametrize(
+    "a, b, equal",
+    [(1, 1, True), ("a", "b", False), ([1, [2]], [1, [2]], True), (np.ones(2), np.ones(2), True), (1, None, False)],
+)
+def test_tasks_of_any_type_are_compared(a, b, equal):
+    assert _equal(a, b) == equal
+
+
+def test_a_signal_is_kept_out_of_the_continual_environments_clock():
+    """TaskSync puts evaluation on the environment's own task, whatever the signal is."""
+    evaluation = EvalCallback(make_env(), eval_freq=8, n_eval_episodes=1, verbose=0, warn=False)
+    make_model("CChainPPO").learn(48, [TaskSignal(switch_every=8), evaluation])
+    assert evaluation.eval_env.get_attr("task_id") == [1]
