@@ -2,19 +2,22 @@
 
 import re
 import sys
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.logger import configure
 from torch import nn
 
 from benchmarks.grid.run import ROOT
+from benchmarks.grid.suites import SUITES
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
+from benchmarks.speed.checkpoint_cost import measure_share
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
@@ -172,6 +175,17 @@ def test_a_table_in_markdown():
     lines = table.markdown().splitlines()
     assert lines[:4] == ["|  | a |", "| --- | --- |", "| b | 1 |", ""]
     assert max(map(len, lines)) <= 120
+
+
+@pytest.mark.parametrize("algorithm", [PPO, DQN])
+def test_the_share_of_a_run_that_saving_takes(monkeypatch, algorithm):
+    monkeypatch.setitem(SUITES, "gym_control", replace(SUITES["gym_control"], checkpoint_freq=2000))
+    arguments = dict(n_steps=32) if algorithm is PPO else dict(buffer_size=100, learning_starts=10**9, train_freq=1)
+    steps, training, saved, share = measure_share(
+        lambda: algorithm("MlpPolicy", "CartPole-v1", batch_size=32, device="cpu", **arguments), "gym_control", 100
+    )
+    assert steps == "2 000" and training != "0 s" and float(saved.removesuffix(" s")) > 0
+    assert 0 < float(share.removesuffix(" %")) < 50
 
 
 def test_the_command_writes_what_it_measured(tmp_path, monkeypatch, capsys):

@@ -597,6 +597,29 @@ def test_other_callbacks(path):
         resume(path, make_env(), [Stop(1), TrainingCheckpoint(32, path)], device="cpu")
 
 
+class Counter:
+    """In a callback."""
+
+    count = 0
+
+
+class Count(BaseCallback):
+    def _init_callback(self):
+        self.counter = Counter()
+        self.counter.count = 1
+
+    def _on_step(self):
+        return True
+
+
+def test_a_callback_of_other_code(tmp_path, monkeypatch):
+    train(make(), tmp_path, Count())
+    monkeypatch.setattr(Count, "_init_callback", lambda self: None)
+    monkeypatch.delattr(sys.modules[__name__], "Counter")
+    with pytest.raises(ValueError, match=r"cannot be put back \(.*Counter.*other code"):
+        go_on(tmp_path, Count())
+
+
 def test_a_finished_training(path):
     for folder in (BEFORE, NEWEST):
         change_info(step(path, folder), total_timesteps=NEWEST)

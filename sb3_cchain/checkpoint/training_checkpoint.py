@@ -208,17 +208,25 @@ class TrainingCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self._resumed is not None:
             checkpoint, self._resumed = self._resumed, None
-            exact = checkpoint.info["training_checkpoint"]["exact"]
-            if not exact:
-                warnings.warn("All environments begin new episodes, so that training goes on, but not exactly (exact=False).")
-            state = checkpoint.read_state()
-            restore_training(self._parts, state, checkpoint.model_path, checkpoint.store)
-            if not exact:
-                begin_new_episodes(self.model, self._parts.envs, state["lasting"])
+            self._restore(checkpoint)
         elif self._stop_signal is not None:
             self._stop()
         elif self._is_due():
             self._save()
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        exact = checkpoint.info["training_checkpoint"]["exact"]
+        if not exact:
+            warnings.warn("All environments begin new episodes, so that training goes on, but not exactly (exact=False).")
+        state = checkpoint.read_state()
+        try:
+            restore_training(self._parts, state, checkpoint.model_path, checkpoint.store)
+        except (AttributeError, ImportError) as error:  # a class that is gone, say
+            raise ValueError(
+                f"{checkpoint.path} cannot be put back ({error}): perhaps callbacks or environments had other code"
+            ) from error
+        if not exact:
+            begin_new_episodes(self.model, self._parts.envs, state["lasting"])
 
     def _on_step(self) -> bool:
         return True
