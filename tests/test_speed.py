@@ -13,6 +13,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.logger import configure
 from torch import nn
 
+from benchmarks.family import cases as family
 from benchmarks.grid.run import ROOT
 from benchmarks.grid.suites import SUITES
 from benchmarks.speed import __main__ as speed
@@ -208,7 +209,9 @@ def test_the_command_writes_what_it_measured(tmp_path, monkeypatch, capsys):
 
 def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
-    assert sorted(places) == sorted(["made_with", *speed.CASES, *speed.OTHERS])
+    of_family = [f"family_{name}" for name in family.CASES]
+    of_family += ["family_evidence", *(f"falls_{name}" for name, case in family.CASES.items() if case.solved is not None)]
+    assert sorted(places) == sorted(["made_with", *speed.CASES, *speed.OTHERS, *of_family])
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
 
 
