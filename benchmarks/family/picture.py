@@ -23,7 +23,8 @@ def plot(case: Case, evaluations: Evaluations, path: Path) -> None:
     names = [name for name in case.variants if evaluations[name]]
     colors = dict(zip(case.variants, COLORS, strict=False))
     base = next(iter(case.variants))
-    figure = import_matplotlib().figure.Figure(figsize=(3.6 * len(names), 3.2), layout="constrained")
+    matplotlib = import_matplotlib()
+    figure = matplotlib.figure.Figure(figsize=(3.6 * len(names), 3.2), layout="constrained")
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for panel, name in zip(panels, names, strict=True):
         seeds = list(evaluations[name].values())
@@ -42,6 +43,7 @@ def plot(case: Case, evaluations: Evaluations, path: Path) -> None:
             panel.set_ylim(bottom=case.worst)
         panel.set(title=case.variants[name].label, xlabel="environment steps")
         panel.title.set_fontsize(10)
+        panel.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))  # 20k, 1M
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(fontsize=8, frameon=False)
     what = "success rate" if case.score == "success_rate" else "mean return"
