@@ -18,8 +18,9 @@ def _leave_to_parent() -> None:
     """In a process that was forked, such as that of an environment: it would hold the locks when its parent has let go."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for file in _open_files.values():
-        # It stays open, but what is still in its buffer is written by the parent alone
-        os.dup2(nowhere, file.fileno())
+        if not file.closed:
+            # It stays open, but what is still in its buffer is written by the parent alone
+            os.dup2(nowhere, file.fileno())
     os.close(nowhere)
 
 

@@ -27,6 +27,7 @@ from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TrainingCheckpoi
 from sb3_cchain.checkpoint import ResumableEnv, find_checkpoint, load_model
 from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
 from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.locked_file import open_locked
 from tests.resume_cases import Record, Stop, Stopped, in_new_process
 
 ARGUMENTS = dict(n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu")
@@ -357,8 +358,10 @@ def test_one_process_at_a_time(path):
 
 
 @pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="needs fork")
-def test_processes_of_environments_do_not_hold_the_lock(path):
+def test_processes_of_environments_do_not_hold_the_lock(path, tmp_path):
     """Those that were made meanwhile, after an error."""
+    closed = open_locked(tmp_path / "closed", "")
+    closed.close()
     folder = CheckpointFolder(path, 2, NEWEST)
     env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
     folder.close()
