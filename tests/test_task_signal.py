@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
 from sb3_cchain.analysis.inspection import inspect_model
@@ -45,6 +45,13 @@ class World(CountEnv):
         if self.n_steps_so_far == self.change_at:
             self.level, self.task_reward = "hard", -5.0
         return *result, info
+
+
+def long_world():
+    """One whose episode does not end."""
+    world = World()
+    world.length = 10**6
+    return world
 
 
 class Curriculum(BaseCallback):
@@ -278,6 +285,24 @@ def test_two_reports_at_a_step_are_one_switch():
     model.set_env(worlds[1])
     model.learn(16, [signal, metrics], reset_num_timesteps=False)
     assert model.continual_state["n_switches"] == 2 - 1
+
+
+def test_the_info_and_a_call_at_a_step_are_one_switch():
+    # The info tells of the new level a step after the change
+    model = make_model("PPO", long_world())
+    model.learn(48, [Curriculum(say, SWITCH + 1), TaskSignal(key="level"), ContinualMetrics()])
+    assert model.continual_state["n_switches"] == 1
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_an_episode_that_goes_on_over_calls_of_learn_does_not_switch_back(algorithm, vec_env_cls):
+    env = make_vec_env(long_world, vec_env_cls=vec_env_cls)
+    model = make_model(algorithm, env)
+    for _ in range(4):
+        model.learn(16, [TaskSignal(key="level"), ContinualMetrics()], reset_num_timesteps=False)
+    env.close()
+    assert model.continual_state["n_switches"] == 1
 
 
 def test_a_world_that_comes_back_is_a_new_task():

@@ -11,7 +11,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.drift import Drift
-from sb3_cchain.tasks.signal import TASK_KEY, first_reset_info, has_other_env, register_signal, task_count
+from sb3_cchain.tasks.signal import (
+    TASK_KEY,
+    episode_goes_on,
+    first_reset_info,
+    has_other_env,
+    register_signal,
+    remember_episode,
+    task_count,
+)
 from sb3_cchain.validation import check_list, check_number
 
 
@@ -119,7 +127,9 @@ class TaskSignal(BaseCallback):
             self.model.task_signal = {"task": 0, "reports": {}}  # type: ignore[attr-defined]
         self._start_time = self.model.start_time
         register_signal(self)
-        self._hear({**self._in_info(first_reset_info(self.training_env)), **self._between_steps()})
+        # In an episode that goes on, steps have told more than the info that it began with
+        began = {} if episode_goes_on(self.model) else first_reset_info(self.training_env)
+        self._hear({**self._in_info(began), **self._between_steps()})
         self._step_task = self.next_task
 
     def _on_rollout_start(self) -> None:
@@ -132,13 +142,16 @@ class TaskSignal(BaseCallback):
         if self.key is not None and self.key not in infos[0]:
             raise ValueError(f"`key`: the environment's info must have {self.key!r}, but it has {sorted(infos[0])}")
         # The info tells of the step that was made, everything else of the next one
-        self._hear(self._in_info(infos[0]))
+        if self._hear(self._in_info(infos[0])):
+            # Whoever calls task_switched() at this step means the same
+            self.model.task_signal["reports"]["count"] = task_count(self.model)  # type: ignore[attr-defined]
         self._step_task = self.next_task
         began = first_reset_info(self.training_env) if dones[0] else {}
         self._hear({**self._in_info(began), **self._between_steps()})
         if self._detector is not None and self.drift_of == "return":
             for index in np.flatnonzero(dones):
                 self._watch(_episode_return(infos[index]))
+        remember_episode(self.model)
         return True
 
     def _in_info(self, info: dict[str, Any]) -> dict[str, Any]:
@@ -156,15 +169,17 @@ class TaskSignal(BaseCallback):
             reports["schedule"] = bisect_right(self.switch_at, self.num_timesteps)
         return reports
 
-    def _hear(self, reports: dict[str, Any]) -> None:
+    def _hear(self, reports: dict[str, Any]) -> bool:
         """What a report says differently from the last time is a switch."""
         state = self.model.task_signal  # type: ignore[attr-defined]
         last = state["reports"]
-        if any(name in last and not _equal(last[name], report) for name, report in reports.items()):
+        switched = any(name in last and not _equal(last[name], report) for name, report in reports.items())
+        if switched:
             state["task"] += 1
             if self._detector is not None:
                 self._detector.reset()
         last.update(reports)
+        return switched
 
     def _watch(self, value: float) -> None:
         assert self._detector is not None
