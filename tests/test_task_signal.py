@@ -372,6 +372,20 @@ def test_resumed_exactly(tmp_path, algorithm, arguments):
     assert {row["task_id"] for row in whole[1].rows} > {0}
 
 
+@pytest.mark.parametrize("arguments", [dict(key="level"), dict(attribute="level")])
+def test_a_new_world_starts_no_random_actions_where_training_is_resumed_exactly(tmp_path, arguments):
+    """Until its state is put back, it has the first level again."""
+
+    def callbacks(folder):
+        return [TaskSignal(**arguments), TaskLearningStarts(8), TrainingCheckpoint(16, folder, keep=10)]
+
+    whole = make_model("DQN", World()).learn(64, callbacks(tmp_path / "whole"))
+    (checkpoint,) = (tmp_path / "whole").glob("step_*48")
+    resumed = resume(checkpoint, World(), callbacks(tmp_path / "resumed"))
+    for name, parameter in whole.policy.state_dict().items():
+        assert parameter.equal(resumed.policy.state_dict()[name]), name
+
+
 def test_drift_of_a_logged_value():
     """Value error and churn are what the algorithm logs."""
     model, heard, signal = make_model("PPO", CountEnv()), [], TaskSignal(drift="adwin", drift_of="train/value_loss")
