@@ -508,7 +508,12 @@ def test_without_a_signal_a_method_still_asks_for_tasks(cls):
 
 @pytest.mark.parametrize(
     "a, b, equal",
-    [(1, 1, True), ("a", "b", False), ([1, [2]], [1, [2]], True), (np.ones(2), np.ones(2), True), (1, None, False)],
+    [
+        *((1, 1, True), ("a", "b", False), (1, None, False), (np.ones(2), np.ones(2), True)),
+        *(([1, [2]], [1, [2]], True), ([1, 2], [1], False)),
+        *(({"a": np.ones(2)}, {"a": np.ones(2)}, True), ({"a": np.ones(2)}, {"a": np.zeros(2)}, False)),
+        *(({"a": 1}, {"b": 1}, False), ((np.ones(2), 1), (np.ones(2), 2), False)),
+    ],
 )
 def test_tasks_of_any_type_are_compared(a, b, equal):
     assert _equal(a, b) == equal

@@ -190,6 +190,10 @@ class TaskSignal(BaseCallback):
 def _equal(a: Any, b: Any) -> bool:
     if hasattr(a, "shape") or hasattr(b, "shape"):  # arrays, tensors and NumPy's numbers
         return np.array_equal(a, b)
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        return len(a) == len(b) and all(map(_equal, a, b))
     return a is b or bool(a == b)
 
 
