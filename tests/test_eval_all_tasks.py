@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -14,6 +14,7 @@ from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.analysis import EvalAllTasks
 from sb3_cchain.analysis.eval_all_tasks import read_task_returns
 from sb3_cchain.analysis.metrics.continual import return_matrix
+from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods import Oracle
 from sb3_cchain.tensorboard.layout import layout_of
 from tests.envs import CountEnv, RandomEnv
@@ -144,6 +145,31 @@ def test_comes_before_what_changes_the_networks(tmp_path):
     # An update of one rollout lies between the saved one and that at the switch; the Oracle's draw is another
     assert not seen[32].equal(seen[0])
     assert (seen[32] - seen[0]).abs().max() < 0.02
+
+
+def test_a_training_that_stops_right_after_a_switch_is_not_evaluated_again():
+    """Oracle has made new networks by then, which were not trained on the task before."""
+    model = PPO("MlpPolicy", tasks(), **ARGUMENTS)
+    stop = StopTrainingOnMaxEpisodes(6)  # the fifth episode is cut by the switch at step 32
+    model.learn(96, [TaskSync(), EvalAllTasks(tasks(), n_eval_episodes=1), Oracle(), stop])
+    assert model.num_timesteps == 39
+    assert [row["timesteps"] for row in model.task_returns[::3]] == [0, 32]
+
+
+class Means(EvalAllTasks):
+    """Records the statistics of the evaluation."""
+
+    def _all_returns(self):
+        self.counts = [*getattr(self, "counts", []), round(self.eval_env.obs_rms.count)]
+        return super()._all_returns()
+
+
+def test_statistics_that_restart_at_the_switch_are_those_of_the_task_before():
+    env, eval_env = (TaskVecNormalize(make_vec_env(tasks)) for _ in range(2))
+    callback = Means(eval_env, n_eval_episodes=1)
+    PPO("MlpPolicy", env, **ARGUMENTS).learn(80, [TaskSync(), callback])
+    # Observations: a reset and 31 or 32 steps, as the one at the switch is the next task's
+    assert callback.counts == [1, 32, 32, 17]
 
 
 def test_resumed_training_goes_on_with_the_rows(tmp_path):

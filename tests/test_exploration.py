@@ -50,6 +50,16 @@ def test_the_exploration_rate_goes_on_over_calls_of_learn(tmp_path):
     assert spy.before_steps[55] == pytest.approx(1 - 0.95 * 15 / 20)
 
 
+@pytest.mark.parametrize("is_given_again", [True, False])
+def test_the_exploration_rate_is_the_models_own_in_the_next_training(is_given_again):
+    model = make_model("DQN", CountEnv(), exploration_fraction=0.5)
+    callbacks = [TaskSignal(switch_at=[40]), ExplorationRateRestart(0.8, n_steps=20)]
+    model.learn(80, callbacks)
+    spy = Spy(lambda model: model.exploration_rate)
+    model.learn(40, [*callbacks, spy] if is_given_again else spy)
+    assert spy.before_steps[10] == pytest.approx(1 - 0.95 * 10 / 20)
+
+
 @pytest.mark.parametrize("log_std, expected", [(None, 0.0), (-0.5, -0.5)])
 @pytest.mark.parametrize("cls", [PPO, A2C, CChainPPO])
 def test_the_standard_deviation(cls, log_std, expected):
@@ -77,6 +87,14 @@ def test_the_entropy_bonus():
         assert model.ent_coef == 0.1
     # From 0.5 to the model's 0.1 over 64 steps, a quarter of it a rollout
     assert spy.before_rollouts == pytest.approx({0: 0.1, 16: 0.1, 32: 0.5, 48: 0.4, 64: 0.3, 80: 0.2, 96: 0.1})
+
+
+def test_the_users_own_entropy_bonus_may_change_between_calls_of_learn():
+    model = make_model("PPO", CountEnv(), ent_coef=0.1)
+    for ent_coef in (0.1, 0.3):
+        model.ent_coef = ent_coef
+        model.learn(32, [TaskSignal(switch_every=16), EntropyBonusRestart(0.5)], reset_num_timesteps=False)
+        assert model.ent_coef == ent_coef
 
 
 @pytest.mark.parametrize(

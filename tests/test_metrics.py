@@ -10,9 +10,9 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSignal, TaskSync
 from sb3_cchain.callbacks import TaskLearningStarts, read_returns
 from sb3_cchain.callbacks.returns_file import ReturnsFile
 from sb3_cchain.envs import RewardScale
@@ -197,6 +197,50 @@ def test_an_episode_that_a_switch_cuts_counts_where_others_ended(tmp_path):
     env = ContinualEnv([lambda: CountEnv(length=10)] * 2, 16)
     CChainPPO("MlpPolicy", env, **SETTINGS).learn(16, callback=ContinualMetrics(path))
     assert path.read_text().splitlines()[1:] == ["16,0,2,8.0"]  # of 10 and 6
+
+
+class TruncatedEnv(CountEnv):
+    """Episodes end by a limit of 8 steps. The info of a step has the number of the task, that of a reset has not."""
+
+    n_steps_so_far = 0
+
+    def step(self, action):
+        observation, reward, end = super().step(action)[:3]
+        self.n_steps_so_far += 1
+        return observation, reward, False, end, {"task_id": (self.n_steps_so_far - 1) // 16}
+
+
+@pytest.mark.parametrize("callbacks", [[], [TaskSignal()]])
+def test_an_episode_that_a_limit_ends_was_not_cut_by_a_switch(callbacks):
+    metrics = ContinualMetrics()
+    PPO("MlpPolicy", TruncatedEnv(length=8), **SETTINGS).learn(48, [*callbacks, metrics])
+    assert [(row["task_id"], row["n_episodes"], row["mean_return"]) for row in metrics.rows] == [(i, 2, 8) for i in range(3)]
+
+
+def test_a_limit_that_falls_on_a_switch_is_an_end():
+    metrics, env = ContinualMetrics(), make_vec_env(lambda: TruncatedEnv(length=8), 2)
+    PPO("MlpPolicy", env, **SETTINGS).learn(32, [TaskSignal(switch_every=16), metrics])
+    assert [(row["task_id"], row["n_episodes"], row["mean_return"]) for row in metrics.rows] == [(0, 2, 8), (1, 2, 8)]
+
+
+def test_a_switch_within_an_episode_that_does_not_end(tmp_path):
+    metrics = ContinualMetrics(tmp_path / "r.csv")
+    model = PPO("MlpPolicy", CountEnv(length=10**6, reward=3.0), **SETTINGS)
+    model.learn(48, [TaskSignal(switch_at=[16, 24]), metrics])
+    assert [tuple(row.values()) for row in metrics.rows] == [(32, 0, 0, 3), (32, 1, 0, 3), (48, 2, 0, 3)]
+    # The row of a task that another environment ended is written once
+    model.set_env(CountEnv(length=10**6))
+    model.learn(16, [TaskSignal(switch_at=[16, 24]), metrics], reset_num_timesteps=False)
+    assert [row["task_id"] for row in read_returns(tmp_path / "r.csv")] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_an_episode_that_goes_on_over_calls_of_learn_is_whole(algorithm):
+    model = make_model(algorithm, DummyVecEnv([lambda: CountEnv(length=24)]))
+    for _ in range(3):
+        metrics = ContinualMetrics()
+        model.learn(16, metrics, reset_num_timesteps=False)
+    assert [row["mean_return"] for row in metrics.rows] == [24, 24]
 
 
 def test_one_environment_after_the_other(tmp_path):

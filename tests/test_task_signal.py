@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
 from sb3_cchain.analysis.inspection import inspect_model
@@ -45,6 +45,13 @@ class World(CountEnv):
         if self.n_steps_so_far == self.change_at:
             self.level, self.task_reward = "hard", -5.0
         return *result, info
+
+
+def long_world():
+    """One whose episode does not end."""
+    world = World()
+    world.length = 10**6
+    return world
 
 
 class Curriculum(BaseCallback):
@@ -280,6 +287,24 @@ def test_two_reports_at_a_step_are_one_switch():
     assert model.continual_state["n_switches"] == 2 - 1
 
 
+def test_the_info_and_a_call_at_a_step_are_one_switch():
+    # The info tells of the new level a step after the change
+    model = make_model("PPO", long_world())
+    model.learn(48, [Curriculum(say, SWITCH + 1), TaskSignal(key="level"), ContinualMetrics()])
+    assert model.continual_state["n_switches"] == 1
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_an_episode_that_goes_on_over_calls_of_learn_does_not_switch_back(algorithm, vec_env_cls):
+    env = make_vec_env(long_world, vec_env_cls=vec_env_cls)
+    model = make_model(algorithm, env)
+    for _ in range(4):
+        model.learn(16, [TaskSignal(key="level"), ContinualMetrics()], reset_num_timesteps=False)
+    env.close()
+    assert model.continual_state["n_switches"] == 1
+
+
 def test_a_world_that_comes_back_is_a_new_task():
     class Cycle(World):
         def step(self, action):
@@ -369,6 +394,20 @@ def test_resumed_exactly(tmp_path, algorithm, arguments):
     resume(checkpoint, World(), resumed := callbacks(tmp_path / "resumed"))
     assert resumed[1].rows == whole[1].rows
     assert {row["task_id"] for row in whole[1].rows} > {0}
+
+
+@pytest.mark.parametrize("arguments", [dict(key="level"), dict(attribute="level")])
+def test_a_new_world_starts_no_random_actions_where_training_is_resumed_exactly(tmp_path, arguments):
+    """Until its state is put back, it has the first level again."""
+
+    def callbacks(folder):
+        return [TaskSignal(**arguments), TaskLearningStarts(8), TrainingCheckpoint(16, folder, keep=10)]
+
+    whole = make_model("DQN", World()).learn(64, callbacks(tmp_path / "whole"))
+    (checkpoint,) = (tmp_path / "whole").glob("step_*48")
+    resumed = resume(checkpoint, World(), callbacks(tmp_path / "resumed"))
+    for name, parameter in whole.policy.state_dict().items():
+        assert parameter.equal(resumed.policy.state_dict()[name]), name
 
 
 def test_drift_of_a_logged_value():
@@ -509,7 +548,12 @@ def test_without_a_signal_a_method_still_asks_for_tasks(cls):
 
 @pytest.mark.parametrize(
     "a, b, equal",
-    [(1, 1, True), ("a", "b", False), ([1, [2]], [1, [2]], True), (np.ones(2), np.ones(2), True), (1, None, False)],
+    [
+        *((1, 1, True), ("a", "b", False), (1, None, False), (np.ones(2), np.ones(2), True)),
+        *(([1, [2]], [1, [2]], True), ([1, 2], [1], False)),
+        *(({"a": np.ones(2)}, {"a": np.ones(2)}, True), ({"a": np.ones(2)}, {"a": np.zeros(2)}, False)),
+        *(({"a": 1}, {"b": 1}, False), ((np.ones(2), 1), (np.ones(2), 2), False)),
+    ],
 )
 def test_tasks_of_any_type_are_compared(a, b, equal):
     assert _equal(a, b) == equal

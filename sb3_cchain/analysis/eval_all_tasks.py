@@ -21,7 +21,14 @@ from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import ReturnsFile, read_returns
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.evaluation import check_same_tasks
-from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info, is_continual, require_continual
+from sb3_cchain.tasks.signal import (
+    TASK_KEY,
+    TaskSwitch,
+    active_signal,
+    first_reset_info,
+    is_continual,
+    require_continual,
+)
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number
@@ -52,9 +59,11 @@ class EvalAllTasks(BaseCallback):
     ``model.task_returns``, too, so that training that is resumed continues both.
 
     Training is not changed, its random numbers included. Each evaluation begins with the same seed, so that all of them see
-    the same episodes, as far as the actions are the same. Returns are the environment's own. The statistics of
-    ``VecNormalize`` are those of training at that moment. With ``cycles``, each task is evaluated once and counts for all of
-    its visits.
+    the same episodes, as far as the actions are the same. Returns are the environment's own. With ``cycles``, each task is
+    evaluated once and counts for all of its visits.
+
+    The statistics of ``VecNormalize`` are those of training at that moment. At a switch at which
+    :class:`~sb3_cchain.envs.TaskVecNormalize` restarts them without a TaskSignal, they are those of the task before.
 
     :param eval_env: The environment to evaluate in, wrapped as that of training and with the same tasks; one that is not
         vectorised will do. None makes one like the training environment, if that was made by :func:`gymnasium.make` (as RL Zoo
@@ -102,6 +111,9 @@ class EvalAllTasks(BaseCallback):
         require_continual(self)
         env = _make_eval_env(self.model) if self.eval_env is None else self.eval_env
         self.eval_env = self.model._wrap_env(env, verbose=0)
+        normalize = unwrap_vec_normalize(self.eval_env)
+        if normalize is not None:
+            normalize.training = False  # its statistics are those of training
         expected, given = self.training_env.observation_space, self.eval_env.observation_space
         if given.shape != expected.shape:
             raise ValueError(
@@ -130,7 +142,8 @@ class EvalAllTasks(BaseCallback):
     def _on_rollout_start(self) -> None:
         before, now = self._switch.task_id, first_reset_info(self.training_env)[TASK_KEY]
         if self._switch.happened(now):
-            self._evaluate(before)
+            self._evaluate(before, at_switch=True)
+            self._trained_task = None  # nothing is left to evaluate if training ends before it is trained on the next
         elif self._is_due():
             self._evaluate(now)
 
@@ -152,8 +165,9 @@ class EvalAllTasks(BaseCallback):
             return True
         return self.interval is not None and self.num_timesteps // self.interval > self._last_step // self.interval
 
-    def _evaluate(self, trained_task: int) -> None:
+    def _evaluate(self, trained_task: int, at_switch: bool = False) -> None:
         self._last_step = self.num_timesteps
+        self._copy_statistics(at_switch)
         with _unchanged(self.model):
             returns = self._all_returns()
         new = [
@@ -166,9 +180,17 @@ class EvalAllTasks(BaseCallback):
         for name, value in _figures(self.rows, trained_task).items():
             self.logger.record(f"continual_eval/{name}", value)
 
+    def _copy_statistics(self, at_switch: bool) -> None:
+        source, target = self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.eval_env)
+        if source is None or target is None or not source.norm_obs:
+            return
+        statistics = source.obs_rms
+        if at_switch and active_signal(self.training_env) is None:
+            statistics = getattr(source, "last_task_obs_rms", statistics)
+        target.obs_rms = deepcopy(statistics)
+
     def _all_returns(self) -> list[float]:
         """The mean return on each task."""
-        _copy_statistics(self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.eval_env))
         n_tasks, cycles = (self.eval_env.get_attr(name, indices=0)[0] for name in ("n_tasks", "cycles"))
         returns = []
         for task in range(n_tasks // cycles):
@@ -231,11 +253,6 @@ def _make_eval_env(model: BaseAlgorithm) -> VecEnv:
         epsilon=normalize.epsilon,
         norm_obs_keys=normalize.norm_obs_keys,
     )
-
-
-def _copy_statistics(source: VecNormalize | None, target: VecNormalize | None) -> None:
-    if source is not None and target is not None and source.norm_obs:
-        target.obs_rms = deepcopy(source.obs_rms)
 
 
 @contextmanager

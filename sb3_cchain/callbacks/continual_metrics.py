@@ -13,7 +13,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
+from sb3_cchain.tasks.signal import (
+    TASK_KEY,
+    TaskSwitch,
+    episode_goes_on,
+    episode_task,
+    first_reset_info,
+    remember_episode,
+    step_task,
+)
 from sb3_cchain.tensorboard.overview import add_overview
 
 
@@ -41,10 +49,12 @@ class ContinualMetrics(BaseCallback):
     that is resumed continues both. When training begins at step 0, a file that is there already is kept as ``<name>.1`` (or
     the next free number).
 
+    Where the task switches within an episode that goes on, such a row is of the steps up to the switch, and the return of the
+    episode counts for the task in which it ends.
+
     In an environment that is not continual the rewards are those before ``VecNormalize``. Its tasks are those of a
     :class:`~sb3_cchain.TaskSignal` before this callback. Without one, each further environment that ``set_env()`` gives,
-    followed by ``learn(..., reset_num_timesteps=False)``, is the next task. An episode that goes on over a switch counts for
-    the task in which it ends.
+    followed by ``learn(..., reset_num_timesteps=False)``, is the next task.
 
     ``CChainPPO`` and ``CChainDQN`` add the callback by themselves in a continual environment, and where there is a
     ``TaskSignal``. Give it to other algorithms.
@@ -75,6 +85,8 @@ class ContinualMetrics(BaseCallback):
         state = None if is_new else getattr(self.model, "continual_state", None)
         if state is None:
             state = {"task_id": None, "n_switches": 0, "reward": 0.0, "n_steps": 0, "n_episodes": 0}
+        if "returns" not in state or not episode_goes_on(self.model):
+            state["returns"] = np.zeros(self.training_env.num_envs)  # of the present episodes so far
         self._state: dict[str, Any] = state
         self.model.continual_state = self._state  # type: ignore[attr-defined]
         self._switch = TaskSwitch(state["task_id"])
@@ -87,6 +99,8 @@ class ContinualMetrics(BaseCallback):
         # Rows of training that was lost after the last save will come again, and so will the row of a task that goes on and
         # in which no episode has ended yet
         goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
+        if not goes_on and state["n_episodes"] == 0:
+            state["n_steps"] = 0  # its row is written
         self.rows = [
             row
             for row in past
@@ -99,7 +113,6 @@ class ContinualMetrics(BaseCallback):
         self._n_rows = Counter(int(row["task_id"]) for row in self.rows)
 
         self._vec_normalize = self.model.get_vec_normalize_env()
-        self._returns = np.zeros(self.training_env.num_envs)
         self._rollout_reward, self._rollout_steps = 0.0, 0
 
     def _on_step(self) -> bool:
@@ -110,6 +123,7 @@ class ContinualMetrics(BaseCallback):
         self._count_rewards(infos)
         if any(dones.tolist()):  # between two steps this is several times as fast as `dones.any()`
             self._count_episodes(infos, dones)
+        remember_episode(self.model)
         return True
 
     def _hear_of(self, task_id: Any) -> None:
@@ -122,6 +136,7 @@ class ContinualMetrics(BaseCallback):
     def _begin_task(self, task_id: Any) -> None:
         if not isinstance(task_id, Integral):
             raise TypeError(f'ContinualMetrics needs an integer as `info["task_id"]`, got {task_id!r}')
+        self._close_task()
         self._state.update(task_id=task_id, reward=0.0, n_steps=0, n_episodes=0)
         self._rollout_reward, self._rollout_steps = 0.0, 0
 
@@ -131,7 +146,7 @@ class ContinualMetrics(BaseCallback):
         else:
             normalize = self._vec_normalize
             rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
-            self._returns += rewards
+            self._state["returns"] += rewards
             reward = float(rewards.sum())
         self._state["reward"] += reward
         self._state["n_steps"] += len(infos)
@@ -139,22 +154,23 @@ class ContinualMetrics(BaseCallback):
         self._rollout_steps += len(infos)
 
     def _count_episodes(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
-        state, is_over = self._state, episode_task(self.model) != self._state["task_id"]
-        ended = np.flatnonzero(dones)
-        # At a switch, an episode that was truncated was cut by it
-        state["n_episodes"] += sum(not (is_over and infos[index].get("TimeLimit.truncated", False)) for index in ended)
+        state, ended = self._state, np.flatnonzero(dones)
+        began = first_reset_info(self.training_env)
+        # An environment that numbers its tasks may end them by cutting the episodes. A switch by the word of another cuts none
+        was_cut = TASK_KEY in began and TaskSwitch(infos[0].get(TASK_KEY)).happened(began[TASK_KEY])
+        state["n_episodes"] += sum(not (was_cut and infos[index].get("TimeLimit.truncated", False)) for index in ended)
         if state["n_episodes"] > 0:
             self._finished[state["task_id"]] += [self._episode_return(infos[index], index) for index in ended]
         else:
             self._endless[state["task_id"]] = state["reward"] / state["n_steps"]
             state.update(reward=0.0, n_steps=0)
-        self._returns[ended] = 0.0
+        state["returns"][ended] = 0.0
 
     def _episode_return(self, info: dict[str, Any], index: int) -> float:
         if "episode_return" in info:
             return info["episode_return"]
         # Monitor's, if there is one, also knows of resets that are not at the end of an episode
-        return float(info["episode"]["r"] if "episode" in info else self._returns[index])
+        return float(info["episode"]["r"] if "episode" in info else self._state["returns"][index])
 
     def _take_rows(self) -> list[dict[str, float]]:
         """The rows since the last call, which are written and kept."""
@@ -190,10 +206,14 @@ class ContinualMetrics(BaseCallback):
         if self._averages:
             logger.record("continual/average_performance", self._average_performance)
 
-    def _on_training_end(self) -> None:
+    def _close_task(self) -> None:
+        """The row of a task in which no episode has ended."""
         state = self._state
         if state["n_episodes"] == 0 and state["n_steps"] > 0:
             self._endless[state["task_id"]] = state["reward"] / state["n_steps"]
+
+    def _on_training_end(self) -> None:
+        self._close_task()
         self._take_rows()
         if self._file is not None:
             self._file.close()

@@ -5,6 +5,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_cchain.tasks.callback_tree import will_be_restored
 from sb3_cchain.tasks.listening import start_listening
 from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.validation import check_number
@@ -43,7 +44,7 @@ class TaskLearningStarts(BaseCallback):
             self.model.learning_starts = self.learning_starts
             self.model.learning_starts_task_id = None  # type: ignore[attr-defined]
         self._switch = TaskSwitch(getattr(self.model, "learning_starts_task_id", None))
-        if self._switch.task_id is not None:
+        if self._switch.task_id is not None and not will_be_restored(self):
             # Training may have been saved at a switch, before this callback heard of it
             self._listen(episode_task(self.model))
 

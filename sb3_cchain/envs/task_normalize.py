@@ -30,6 +30,8 @@ class TaskVecNormalize(VecNormalize):
     ``training=False`` statistics are neither updated nor restarted, so that an evaluation environment has the statistics of
     training (``EvalCallback`` copies them).
 
+    After a switch the statistics of the task before are ``last_task_obs_rms``.
+
     Saved statistics belong to a task. When training is resumed with them, they go on if the environment is put on that task
     (:class:`~sb3_cchain.TaskSync` does so) and restart otherwise.
 
@@ -132,6 +134,7 @@ class TaskVecNormalize(VecNormalize):
 
     def _restart(self) -> None:
         if self.norm_obs:
+            self.last_task_obs_rms = self.obs_rms
             rms: Any = self.obs_rms
             if isinstance(rms, dict):
                 self.obs_rms = {key: _fresh(part) for key, part in rms.items()}

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3 import DQN
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.utils import ConstantSchedule
+from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.networks.compiled import uncompiled
@@ -46,6 +46,7 @@ class ExplorationRateRestart(TaskBoundary):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
+        self._put_back_schedule()  # an interrupted training may have left another one
         if self.num_timesteps == 0 or not hasattr(self.model, "exploration_restart"):
             self.model.exploration_restart = None  # type: ignore[attr-defined]
 
@@ -61,6 +62,15 @@ class ExplorationRateRestart(TaskBoundary):
             # DQN asks for it at the end of this step
             self.model.exploration_schedule = ConstantSchedule(rate)
         return super()._on_step()
+
+    def _on_training_end(self) -> None:
+        self._put_back_schedule()
+
+    def _put_back_schedule(self) -> None:
+        model = self.model
+        model.exploration_schedule = LinearSchedule(
+            model.exploration_initial_eps, model.exploration_final_eps, model.exploration_fraction
+        )
 
 
 class LogStdRestart(TaskBoundary):
@@ -102,8 +112,8 @@ class EntropyBonusRestart(TaskBoundary):
     """
     Raises ``ent_coef`` of PPO or A2C at each task switch, from where it goes down linearly to the model's own.
 
-    The first task has the model's own. It is kept as ``model.own_ent_coef``, and the step of the last switch as
-    ``model.ent_coef_restart``.
+    The first task has the model's own. During training it is kept as ``model.own_ent_coef``; the step of the last switch is
+    kept as ``model.ent_coef_restart``.
 
     :param ent_coef: The coefficient at the beginning of each later task
     :param n_steps: Environment steps until it is the model's own again
@@ -144,7 +154,9 @@ class EntropyBonusRestart(TaskBoundary):
             model.ent_coef = _between(self.ent_coef, model.own_ent_coef, share)
 
     def _on_training_end(self) -> None:
-        self.model.ent_coef = self.model.own_ent_coef  # type: ignore[attr-defined]
+        model: Any = self.model
+        model.ent_coef = model.own_ent_coef
+        del model.own_ent_coef  # the user may give the model another one before the next `learn()`
 
 
 def _between(initial: float, final: float, share: float) -> float:

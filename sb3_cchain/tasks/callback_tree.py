@@ -33,3 +33,12 @@ def require_single(callback: BaseCallback) -> None:
     n_callbacks = sum(isinstance(given, kind) for given in iterate_callbacks(callback.locals.get("callback")))
     if n_callbacks > 1:
         raise ValueError(f"`learn()` was given {n_callbacks} callbacks {kind.__name__}: give it one")
+
+
+def will_be_restored(callback: BaseCallback) -> bool:
+    """
+    :param callback: A callback, when training starts
+    :return: Whether a :class:`~sb3_cchain.TrainingCheckpoint` will put back its saved state, and that of the environment,
+        which is a new one until then
+    """
+    return any(getattr(given, "is_resuming", False) for given in iterate_callbacks(callback.locals.get("callback")))

@@ -76,6 +76,28 @@ def first_reset_info(env: VecEnv) -> dict[str, Any]:
     return env.unwrapped.reset_infos[0]
 
 
+# The info with which the episode of each model's last step began
+_last_reset_infos: WeakKeyDictionary[BaseAlgorithm, dict[str, Any]] = WeakKeyDictionary()
+
+
+def remember_episode(model: BaseAlgorithm) -> None:
+    """
+    :param model: A model after a step, whose environment's episode :func:`episode_goes_on` is to recognise
+    """
+    assert model.env is not None
+    _last_reset_infos[model] = first_reset_info(model.env)
+
+
+def episode_goes_on(model: BaseAlgorithm) -> bool:
+    """
+    :param model: A model when training starts
+    :return: Whether its environment has not been reset since :func:`remember_episode`, as between two calls of
+        ``learn(..., reset_num_timesteps=False)``
+    """
+    assert model.env is not None
+    return model in _last_reset_infos and _last_reset_infos[model] is first_reset_info(model.env)
+
+
 # The TaskSignal that was given to learn(), by the vectorised environment that is trained in
 _signals: WeakKeyDictionary[VecEnv, ref[Any]] = WeakKeyDictionary()
 

@@ -11,7 +11,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.drift import Drift
-from sb3_cchain.tasks.signal import TASK_KEY, first_reset_info, has_other_env, register_signal, task_count
+from sb3_cchain.tasks.signal import (
+    TASK_KEY,
+    episode_goes_on,
+    first_reset_info,
+    has_other_env,
+    register_signal,
+    remember_episode,
+    task_count,
+)
 from sb3_cchain.validation import check_list, check_number
 
 
@@ -121,7 +129,9 @@ class TaskSignal(BaseCallback):
         self._start_time = self.model.start_time
         register_signal(self)
         task_count(self.model)  # set_env() may have given another environment
-        self._hear(self._in_info(first_reset_info(self.training_env)), self._between_steps())
+        # In an episode that goes on, steps have told more than the info that it began with
+        began = {} if episode_goes_on(self.model) else first_reset_info(self.training_env)
+        self._hear(self._in_info(began), self._between_steps())
         self._step_task = self.next_task
 
     def _on_rollout_start(self) -> None:
@@ -138,12 +148,15 @@ class TaskSignal(BaseCallback):
         if self.key is not None and self.key not in infos[0]:
             raise ValueError(f"`key`: the environment's info must have {self.key!r}, but it has {sorted(infos[0])}")
         # The info tells of the step that was made, everything else of the next one
-        self._hear(self._in_info(infos[0]))
+        if self._hear(self._in_info(infos[0])):
+            # Whoever calls task_switched() at this step means the same
+            self.model.task_signal["reports"]["count"] = task_count(self.model)  # type: ignore[attr-defined]
         self._step_task = self.next_task
         self._hear(self._in_info(first_reset_info(self.training_env)) if dones[0] else {}, self._between_steps())
         if self._detector is not None and self.drift_of == "return" and any(dones.tolist()):
             for index in np.flatnonzero(dones):
                 self._watch(_episode_return(infos[index]))
+        remember_episode(self.model)
         return True
 
     def _in_info(self, info: dict[str, Any]) -> dict[str, Any]:
@@ -161,14 +174,18 @@ class TaskSignal(BaseCallback):
             reports["schedule"] = bisect_right(self.switch_at, self.num_timesteps)
         return reports
 
-    def _hear(self, *reports: dict[str, Any]) -> None:
-        """Where a report is another one than the last time, the task has switched."""
+    def _hear(self, *reports: dict[str, Any]) -> bool:
+        """
+        :param reports: What the sources report
+        :return: Whether the task has switched, because a report is another one than the last time
+        """
         last, has_switched = self.model.task_signal["reports"], False  # type: ignore[attr-defined]
         for name, report in [pair for each in reports for pair in each.items()]:
             has_switched |= name in last and not _equal(last[name], report)
             last[name] = report
         if has_switched:
             self._begin_task()
+        return has_switched
 
     def _watch(self, value: float) -> None:
         assert self._detector is not None
@@ -185,6 +202,10 @@ def _equal(a: Any, b: Any) -> bool:
         return True
     if hasattr(a, "shape") or hasattr(b, "shape"):  # arrays, tensors and NumPy's numbers
         return np.array_equal(a, b)
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        return len(a) == len(b) and all(map(_equal, a, b))
     return bool(a == b)
 
 
