@@ -19,9 +19,11 @@ ARGUMENTS = {
     "ChurnMonitor": dict(interval=1),
     "NetworkHealth": dict(interval=1),
     "NTKCallback": dict(n_minibatches=4, interval=1, picture_interval=0),
+    "OverallSchedule": dict(total_timesteps=100),
     "ReDo": dict(tau=0.5, interval=1),
     "ShrinkAndPerturb": dict(shrink=0.5),
     "TaskLearningStarts": dict(learning_starts=4),
+    "TaskSchedule": dict(steps_per_task=16),
     "TrainingCheckpoint": dict(save_freq=8, path="checkpoints"),
 }
 PUBLIC = {
@@ -33,7 +35,10 @@ PUBLIC = {
 
 
 def make_callback(name):
-    return PUBLIC[name](**ARGUMENTS.get(name, {}))
+    arguments = ARGUMENTS.get(name, {})
+    if name == "EvalAllTasks":
+        arguments = dict(eval_env=make_env(), n_eval_episodes=1)
+    return PUBLIC[name](**arguments)
 
 
 class Interruption(BaseCallback):

@@ -157,3 +157,10 @@ def test_a_schedule_that_is_at_0_too_early_warns_once(cls):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make(cls).learn(64, OverallSchedule(64))
+
+
+@pytest.mark.parametrize("second", [lambda: OverallSchedule(128), lambda: TaskSchedule(64)])
+def test_one_callback_moves_schedules(second):
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, device="cpu")
+    with pytest.raises(ValueError, match="was given OverallSchedule and "):
+        model.learn(64, [TaskSignal(switch_every=64), OverallSchedule(128), second()])

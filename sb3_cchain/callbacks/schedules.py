@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.validation import check_number
 
 
@@ -27,7 +28,7 @@ class OverallSchedule(BaseCallback):
     Stable-Baselines3. It warns where a call of ``learn()`` goes on beyond the end; the schedules stay there.
 
     :param total_timesteps: Environment steps of the whole training
-    :raises ValueError: When it is not a positive integer
+    :raises ValueError: When it is not a positive integer. When training starts, for a second callback that moves schedules
     """
 
     def __init__(self, total_timesteps: int):
@@ -37,6 +38,7 @@ class OverallSchedule(BaseCallback):
         self._hooks = TrainingHooks()
 
     def _on_training_start(self) -> None:
+        _require_one(self)
         end = self.locals["total_timesteps"]
         if end > self.total_timesteps:
             warnings.warn(
@@ -60,7 +62,7 @@ class TaskSchedule(TaskBoundary):
     lasts longer, they stay at their ends. The step at which the task began is kept as ``model.task_schedule_start``.
 
     :param steps_per_task: Environment steps in which the schedules go to their end
-    :raises ValueError: When it is not a positive integer
+    :raises ValueError: When it is not a positive integer. When training starts, for a second callback that moves schedules
     """
 
     def __init__(self, steps_per_task: int):
@@ -71,6 +73,7 @@ class TaskSchedule(TaskBoundary):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
+        _require_one(self)
         model: Any = self.model
         if self.num_timesteps == 0 or not hasattr(model, "task_schedule_start"):
             model.task_schedule_start = self.num_timesteps
@@ -85,6 +88,15 @@ class TaskSchedule(TaskBoundary):
 
     def _on_training_end(self) -> None:
         self._hooks.remove()
+
+
+def _require_one(callback: BaseCallback) -> None:
+    given = iterate_callbacks(callback.locals.get("callback"))
+    names = [type(each).__name__ for each in given if isinstance(each, (OverallSchedule, TaskSchedule))]
+    if len(names) > 1:
+        raise ValueError(
+            f"`learn()` was given {' and '.join(names)}, which both move schedules: give it one"
+        )
 
 
 def _put_in(hooks: TrainingHooks, model: BaseAlgorithm, progress: Callable[[], float]) -> None:

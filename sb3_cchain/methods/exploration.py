@@ -5,8 +5,8 @@ from typing import Any
 import torch as th
 from stable_baselines3 import DQN
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.tasks.boundary import TaskBoundary
@@ -38,6 +38,7 @@ class ExplorationRateRestart(TaskBoundary):
         self.initial_eps = initial_eps
         self.final_eps = final_eps
         self.n_steps = n_steps
+        self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
         # QR-DQN of sb3-contrib has it, too
@@ -46,31 +47,24 @@ class ExplorationRateRestart(TaskBoundary):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._put_back_schedule()  # an interrupted training may have left another one
         if self.num_timesteps == 0 or not hasattr(self.model, "exploration_restart"):
             self.model.exploration_restart = None  # type: ignore[attr-defined]
+        self._hooks.begin(self.model)
+        # Where DQN sets it by its own schedule
+        self._hooks.after_call(self.model, "_on_step", self._set_rate)
 
     def _on_task_switch(self) -> None:
         self.model.exploration_restart = self.num_timesteps  # type: ignore[attr-defined]
         self.model.exploration_rate = self.initial_eps
 
-    def _on_step(self) -> bool:
+    def _set_rate(self, _: Any) -> None:
         begin = self.model.exploration_restart  # type: ignore[attr-defined]
         if begin is not None:
             final = self.model.exploration_final_eps if self.final_eps is None else self.final_eps
-            rate = _between(self.initial_eps, final, (self.num_timesteps - begin) / self.n_steps)
-            # DQN asks for it at the end of this step
-            self.model.exploration_schedule = ConstantSchedule(rate)
-        return super()._on_step()
+            self.model.exploration_rate = _between(self.initial_eps, final, (self.num_timesteps - begin) / self.n_steps)
 
     def _on_training_end(self) -> None:
-        self._put_back_schedule()
-
-    def _put_back_schedule(self) -> None:
-        model = self.model
-        model.exploration_schedule = LinearSchedule(
-            model.exploration_initial_eps, model.exploration_final_eps, model.exploration_fraction
-        )
+        self._hooks.remove()
 
 
 class LogStdRestart(TaskBoundary):
