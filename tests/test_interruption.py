@@ -19,6 +19,7 @@ ARGUMENTS = {
     "ChurnMonitor": dict(interval=1),
     "NetworkHealth": dict(interval=1),
     "NTKCallback": dict(n_minibatches=4, interval=1, picture_interval=0),
+    "LayerReset": dict(interval=16),
     "ReDo": dict(tau=0.5, interval=1),
     "ShrinkAndPerturb": dict(shrink=0.5),
     "TaskLearningStarts": dict(learning_starts=4),

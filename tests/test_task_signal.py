@@ -16,7 +16,7 @@ from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingChe
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
-from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart, Oracle, ShrinkAndPerturb
+from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LayerReset, LogStdRestart, Oracle, ShrinkAndPerturb
 from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
 from sb3_cchain.tasks import TaskBoundary
 from sb3_cchain.tasks.task_signal import _equal
@@ -184,6 +184,7 @@ def learning_starts(algorithm):
 LISTENERS = {
     "Oracle": boundary(Oracle),
     "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
+    "LayerReset": boundary(LayerReset),
     "ExplorationRateRestart": boundary(ExplorationRateRestart),
     "EntropyBonusRestart": boundary(EntropyBonusRestart),
     "LogStdRestart": gaussian,
@@ -194,7 +195,7 @@ LISTENERS = {
     "TaskVecNormalize": normalization,
 }
 # Oracle with both algorithms, the others in turn
-WITH_DQN = {"Oracle", "ShrinkAndPerturb", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
+WITH_DQN = {"Oracle", "ShrinkAndPerturb", "LayerReset", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
 WITH_PPO = LISTENERS.keys() - WITH_DQN | {"Oracle"}
 
 

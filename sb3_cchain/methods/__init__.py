@@ -3,6 +3,7 @@
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.exploration import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
 from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.methods.oracle import Oracle
@@ -19,6 +20,7 @@ __all__ = [
     "EntropyBonusRestart",
     "ExplorationRateRestart",
     "L2Init",
+    "LayerReset",
     "LogStdRestart",
     "OptimizerMetrics",
     "OptimizerWrapper",

@@ -18,6 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_cchain.algorithms import CChainA2C, CChainDDPG, CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.methods.oracle import Oracle
@@ -161,6 +162,12 @@ REGISTRY = (
         *("crelu", "ppo_crelu", PPO, "CReLU", "teal", PLASTICITY_PAGE),
         policy=CReLUPolicy,
         policy_kwargs={"activation_fn": CReLU},
+    ),
+    Method(
+        *("layer_reset", "ppo_layer_reset", PPO, "Layer reset", "indigo", PLASTICITY_PAGE),
+        callbacks=(LayerReset,),
+        # Of the four layers of the Gym Control networks. 20, 4 and 2 resets in a task
+        grid={"n_layers": [1, 2, 4], "interval": [8_000, 40_000, 80_000]},
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
