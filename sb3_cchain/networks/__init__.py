@@ -3,6 +3,7 @@
 from sb3_cchain.networks.activations import CReLU
 from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.networks.injection_policies import InjectionDQNPolicy, InjectionPolicy
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.mlp_policies import CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
 from sb3_cchain.networks.transfer import Transferred, transfer
@@ -13,6 +14,8 @@ __all__ = [
     "CReLUPolicy",
     "ImpalaCNN",
     "ImpalaPolicy",
+    "InjectionDQNPolicy",
+    "InjectionPolicy",
     "LayerNormDQNPolicy",
     "LayerNormPolicy",
     "MinAtarCNN",
