@@ -11,7 +11,7 @@ from sb3_cchain import TaskSync
 from sb3_cchain.methods import LayerReset
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.layer_reset import network_layers, reset_layers
-from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
+from sb3_cchain.networks import InjectionPolicy, LayerNormDQNPolicy, LayerNormPolicy
 from tests.envs import CountEnv, RandomEnv
 from tests.method_models import ALGORITHMS, STEPS_PER_TASK, make_env, make_model, make_random_env, parameters
 
@@ -171,6 +171,8 @@ def test_what_it_refuses():
         make_model("PPO").learn(10, callback=LayerReset(3))
     with pytest.raises(TypeError, match="the training environment is not one"):
         make_model("PPO", env=CountEnv()).learn(10, callback=LayerReset())
+    with pytest.raises(TypeError, match=r"does not know heads for plasticity injection, got InjectionPolicy"):
+        make_model("PPO", policy=InjectionPolicy).learn(10, callback=LayerReset())
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,)))
     with pytest.raises(TypeError, match=r"LayerReset is for on-policy algorithms and DQN, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=LayerReset())

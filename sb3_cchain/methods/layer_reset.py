@@ -8,6 +8,7 @@ from torch import nn
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
@@ -49,8 +50,8 @@ class LayerReset(TaskBoundary):
         and 200 000 in DeepMind Control, with an update or two per step.
     :raises ValueError: When an argument is neither None nor a positive integer; when training starts, when a network has fewer
         layers than ``n_layers``
-    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, for recurrent networks, and
-        with ``interval=None`` for an environment that is not continual
+    :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, for recurrent networks, for
+        the policies of :class:`PlasticityInjection`, and with ``interval=None`` for an environment that is not continual
     """
 
     model: OnPolicyAlgorithm | DQN
@@ -69,7 +70,10 @@ class LayerReset(TaskBoundary):
             raise TypeError(f"LayerReset is for on-policy algorithms and DQN, got {type(self.model).__name__}")
         if hasattr(self.model, "_last_lstm_states"):
             raise TypeError(f"LayerReset does not know recurrent networks, got {type(self.model).__name__}")
-        n_layers = min(map(len, network_layers(uncompiled(self.model.policy))))
+        policy = uncompiled(self.model.policy)
+        if any(isinstance(module, Injectable) for module in policy.modules()):
+            raise TypeError(f"LayerReset does not know heads for plasticity injection, got {type(policy).__name__}")
+        n_layers = min(map(len, network_layers(policy)))
         if self.n_layers is not None and self.n_layers > n_layers:
             raise ValueError(f"`n_layers` must be at most {n_layers}, the layers of the network, got {self.n_layers!r}")
 

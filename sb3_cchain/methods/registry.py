@@ -29,7 +29,7 @@ from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.weight_clipping import WeightClipping
-from sb3_cchain.networks import CReLU, CReLUPolicy, InjectionPolicy, LayerNormPolicy
+from sb3_cchain.networks import CReLU, CReLUPolicy, FourierFeatures, FourierPolicy, InjectionPolicy, LayerNormPolicy
 
 
 @dataclass(frozen=True)
@@ -183,6 +183,11 @@ REGISTRY = (
         optimizer_kwargs={"n_output_layers": 2},
         callbacks=(OptimizerMetrics,),
         policy=LayerNormPolicy,
+    ),
+    Method(
+        *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
+        policy=FourierPolicy,
+        policy_kwargs={"activation_fn": FourierFeatures},
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
