@@ -29,6 +29,8 @@ OPTIMIZER_ARGUMENTS = {
 }
 CALLBACK_ARGUMENTS = {
     "ReDo": dict(tau=0.3, interval=1),
+    "LayerReset": dict(n_layers=1, interval=16),
+    "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),
 }
 OPTIMIZERS = {method.name: method for method in REGISTRY if method.optimizer_class is not None}

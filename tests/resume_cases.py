@@ -37,7 +37,9 @@ from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, find_checkpoint, resume
 from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.envs import ContinualProcgenVecEnv, TaskVecNormalize
+from sb3_cchain.methods import PlasticityInjection
 from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
+from sb3_cchain.networks import InjectionDQNPolicy
 from tests.method_models import make_callback, nested_optimizers, optimizer_arguments
 
 # Another one in each process, so that nothing goes on well because it began alike
@@ -240,6 +242,11 @@ CASES = {
         *(CChainPPO, vec_env("Continual/Acrobot-v1", subproc=True, **ACROBOT)),
         lambda env: {**ON_POLICY, **CHURN, "policy_kwargs": dict(NET, **nested_optimizers()), "learning_rate": decay},
         callbacks=lambda: [NetworkHealth(interval=2)],
+        continual=True,
+    ),
+    "CChainDQN plasticity injection cartpole": Case(
+        *(CChainDQN, CONTINUAL_CARTPOLE, dict(OFF_POLICY, **CHURN, train_freq=2), InjectionDQNPolicy),
+        callbacks=lambda: [PlasticityInjection()],
         continual=True,
     ),
     "PPO NTK acrobot": Case(

@@ -20,6 +20,7 @@ ARGUMENTS = {
     "NetworkHealth": dict(interval=1),
     "NTKCallback": dict(n_minibatches=4, interval=1, picture_interval=0),
     "OverallSchedule": dict(total_timesteps=100),
+    "LayerReset": dict(interval=16),
     "ReDo": dict(tau=0.5, interval=1),
     "ShrinkAndPerturb": dict(shrink=0.5),
     "TaskLearningStarts": dict(learning_starts=4),

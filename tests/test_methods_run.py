@@ -26,7 +26,14 @@ METHODS = {
     "all": nested_optimizers(),
 }
 # Besides the one key or more that each method logs
-ALL_KEYS = {"trac/scale", "weight_clipping/share", "l2_init/loss", "l2_init/distance", "parseval/loss"}
+ALL_KEYS = {
+    "trac/scale",
+    "weight_clipping/share",
+    "l2_init/loss",
+    "l2_init/distance",
+    "parseval/loss",
+    "normalize_and_project/norm",
+}
 
 
 def make(cls, method):

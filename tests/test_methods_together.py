@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3 import DQN
 
 from sb3_cchain import TaskSync
-from sb3_cchain.methods import AdamRel, OptimizerMetrics, Oracle, ReDo, ShrinkAndPerturb
+from sb3_cchain.methods import AdamRel, OptimizerMetrics, Oracle, PlasticityInjection, ReDo, ShrinkAndPerturb
 from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
 from tests.method_models import (
     ALGORITHMS,
@@ -22,9 +22,9 @@ from tests.method_models import (
 )
 
 
-# AdamRel changes the optimiser, and is tested with the others below
+# AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own
 def callbacks():
-    return [TaskSync(), *(make_callback(cls) for cls in CALLBACKS if cls is not AdamRel)]
+    return [TaskSync(), *(make_callback(cls) for cls in CALLBACKS if cls not in (AdamRel, PlasticityInjection))]
 
 
 def find(cls, callbacks):
@@ -72,7 +72,7 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
     def callbacks():
         redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
         # The environment is not continual, so Oracle has nothing to do
-        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle)]
+        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle, PlasticityInjection)]
         return [redo, *others, OptimizerMetrics()] if everything else [redo]
 
     layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy

@@ -1,4 +1,4 @@
-"""LayerNorm and CReLU in SB3's MLP policies, LayerNorm in the MinAtar network."""
+"""LayerNorm, CReLU and deep Fourier features in SB3's MLP policies, LayerNorm in the MinAtar network."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,16 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO
-from sb3_cchain.networks import CReLU, CReLUDQNPolicy, CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
+from sb3_cchain.networks import (
+    CReLU,
+    CReLUDQNPolicy,
+    CReLUPolicy,
+    FourierDQNPolicy,
+    FourierFeatures,
+    FourierPolicy,
+    LayerNormDQNPolicy,
+    LayerNormPolicy,
+)
 from sb3_cchain.networks.extractors import MinAtarCNN
 from sb3_cchain.networks.policy_outputs import has_training_mode
 from tests.envs import RandomEnv
@@ -32,6 +41,12 @@ def kinds(network):
 def test_crelu_by_hand():
     assert CReLU()(th.tensor([[1.0, -2.0, 0.0]])).tolist() == [[1.0, 0.0, 0.0, 0.0, 2.0, 0.0]]
     assert CReLU()(th.zeros(2, 3, 4, 4)).shape == (2, 6, 4, 4)
+
+
+def test_fourier_features_by_hand():
+    features = FourierFeatures()(th.tensor([[0.0, th.pi / 6, -th.pi / 2]]))
+    assert features.flatten().tolist() == pytest.approx([0, 0.5, -1, 1, 0.75**0.5, 0], abs=1e-6)
+    assert FourierFeatures()(th.zeros(2, 3, 4, 4)).shape == (2, 6, 4, 4)
 
 
 @pytest.mark.parametrize(
@@ -83,13 +98,17 @@ def test_layers_of_a_q_network():
     assert [m.out_features for m in default.q_net.q_net if isinstance(m, nn.Linear)] == [64, 64, 3]
 
 
-def test_crelu_doubles_the_width():
-    policy = make(PPO, CReLUPolicy, net_arch=dict(pi=[5, 6], vf=[])).policy
-    expected = [("Linear", (5, 4), (5,)), ("CReLU",), ("Linear", (6, 10), (6,)), ("CReLU",)]
+@pytest.mark.parametrize(
+    "policy, dqn_policy, activation",
+    [(CReLUPolicy, CReLUDQNPolicy, "CReLU"), (FourierPolicy, FourierDQNPolicy, "FourierFeatures")],
+)
+def test_doubles_the_width(policy, dqn_policy, activation):
+    policy = make(PPO, policy, net_arch=dict(pi=[5, 6], vf=[])).policy
+    expected = [("Linear", (5, 4), (5,)), (activation,), ("Linear", (6, 10), (6,)), (activation,)]
     assert kinds(policy.mlp_extractor.policy_net) == expected
     assert policy.action_net.in_features == 12 and policy.value_net.in_features == 4
-    q_net = make(DQN, CReLUDQNPolicy, net_arch=[5]).policy.q_net.q_net
-    assert kinds(q_net) == [("Linear", (5, 4), (5,)), ("CReLU",), ("Linear", (3, 10), (3,))]
+    q_net = make(DQN, dqn_policy, net_arch=[5]).policy.q_net.q_net
+    assert kinds(q_net) == [("Linear", (5, 4), (5,)), (activation,), ("Linear", (3, 10), (3,))]
 
 
 def test_both_together():
@@ -99,7 +118,7 @@ def test_both_together():
 
 
 @pytest.mark.parametrize("algorithm", [PPO, CChainPPO])
-@pytest.mark.parametrize("policy", [LayerNormPolicy, CReLUPolicy])
+@pytest.mark.parametrize("policy", [LayerNormPolicy, CReLUPolicy, FourierPolicy])
 @pytest.mark.parametrize(
     "observation_space, action_space, policy_kwargs",
     [
@@ -113,7 +132,7 @@ def test_on_policy_training_and_loading(tmp_path, algorithm, policy, observation
 
 
 @pytest.mark.parametrize("algorithm", [DQN, CChainDQN])
-@pytest.mark.parametrize("policy", [LayerNormDQNPolicy, CReLUDQNPolicy])
+@pytest.mark.parametrize("policy", [LayerNormDQNPolicy, CReLUDQNPolicy, FourierDQNPolicy])
 def test_off_policy_training_and_loading(tmp_path, algorithm, policy):
     check_training(tmp_path, make(algorithm, policy, net_arch=[8]))
 

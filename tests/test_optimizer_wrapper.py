@@ -18,6 +18,7 @@ ARGUMENTS = {
     "weight_clipping": dict(clip_ratio=0.8),
     "l2_init": dict(coef=0.3),
     "parseval": dict(n_output_layers=1, coef=0.1),
+    "normalize_and_project": dict(n_output_layers=1),
 }
 WRAPPERS = {
     **{
@@ -205,7 +206,10 @@ def test_closure(name):
     assert_same(*networks)
 
 
-@pytest.mark.parametrize("name", [name for name in WRAPPERS if name not in ("parseval", "nested")])  # other output layers
+WITH_OUTPUT_LAYERS = ("parseval", "normalize_and_project", "nested")  # they would be other ones
+
+
+@pytest.mark.parametrize("name", [name for name in WRAPPERS if name not in WITH_OUTPUT_LAYERS])
 def test_parameters_can_be_added(name):
     networks = [make_network(), make_network()]
     together = make(name, networks[0])

@@ -16,8 +16,17 @@ from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingChe
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
-from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart, Oracle, ShrinkAndPerturb
+from sb3_cchain.methods import (
+    EntropyBonusRestart,
+    ExplorationRateRestart,
+    LayerReset,
+    LogStdRestart,
+    Oracle,
+    PlasticityInjection,
+    ShrinkAndPerturb,
+)
 from sb3_cchain.methods.registry import FAMILY_PAGE, REGISTRY
+from sb3_cchain.networks import InjectionPolicy
 from sb3_cchain.tasks import TaskBoundary
 from sb3_cchain.tasks.task_signal import _equal
 from tests.envs import CountEnv
@@ -138,10 +147,10 @@ def count_calls(owner, name):
     return calls
 
 
-def boundary(make):
+def boundary(make, ppo_policy="MlpPolicy"):
     def listener(algorithm):
         callback = make()
-        return make_model(algorithm, World()), [callback], count_calls(callback, "_on_task_switch")
+        return make_model(algorithm, World(), policy=ppo_policy), [callback], count_calls(callback, "_on_task_switch")
 
     return listener
 
@@ -191,6 +200,8 @@ def learning_starts(algorithm):
 LISTENERS = {
     "Oracle": boundary(Oracle),
     "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
+    "LayerReset": boundary(LayerReset),
+    "PlasticityInjection": boundary(PlasticityInjection, InjectionPolicy),
     "ExplorationRateRestart": boundary(ExplorationRateRestart),
     "EntropyBonusRestart": boundary(EntropyBonusRestart),
     "LogStdRestart": gaussian,
@@ -201,7 +212,7 @@ LISTENERS = {
     "TaskVecNormalize": normalization,
 }
 # Oracle with both algorithms, the others in turn
-WITH_DQN = {"Oracle", "ShrinkAndPerturb", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
+WITH_DQN = {"Oracle", "ShrinkAndPerturb", "LayerReset", "ExplorationRateRestart", "TaskLearningStarts", "CChainCallback"}
 WITH_PPO = LISTENERS.keys() - WITH_DQN | {"Oracle"}
 
 

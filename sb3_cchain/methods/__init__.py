@@ -3,11 +3,14 @@
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.exploration import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
 from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.layer_reset import LayerReset
+from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.methods.oracle import Oracle
 from sb3_cchain.methods.parseval import Parseval
 from sb3_cchain.methods.penalty import Penalty
+from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
 from sb3_cchain.methods.trac import TRAC
@@ -19,12 +22,15 @@ __all__ = [
     "EntropyBonusRestart",
     "ExplorationRateRestart",
     "L2Init",
+    "LayerReset",
     "LogStdRestart",
+    "NormalizeAndProject",
     "OptimizerMetrics",
     "OptimizerWrapper",
     "Oracle",
     "Parseval",
     "Penalty",
+    "PlasticityInjection",
     "ReDo",
     "ShrinkAndPerturb",
     "WeightClipping",

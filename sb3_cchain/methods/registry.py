@@ -18,15 +18,18 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_cchain.algorithms import CChainA2C, CChainDDPG, CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.l2_init import L2Init
+from sb3_cchain.methods.layer_reset import LayerReset
+from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.methods.oracle import Oracle
 from sb3_cchain.methods.parseval import Parseval
+from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.weight_clipping import WeightClipping
-from sb3_cchain.networks import CReLU, CReLUPolicy, LayerNormPolicy
+from sb3_cchain.networks import CReLU, CReLUPolicy, FourierFeatures, FourierPolicy, InjectionPolicy, LayerNormPolicy
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,30 @@ REGISTRY = (
         *("crelu", "ppo_crelu", PPO, "CReLU", "teal", PLASTICITY_PAGE),
         policy=CReLUPolicy,
         policy_kwargs={"activation_fn": CReLU},
+    ),
+    Method(
+        *("layer_reset", "ppo_layer_reset", PPO, "Layer reset", "indigo", PLASTICITY_PAGE),
+        callbacks=(LayerReset,),
+        # Of the four layers of the Gym Control networks. 20, 4 and 2 resets in a task
+        grid={"n_layers": [1, 2, 4], "interval": [8_000, 40_000, 80_000]},
+    ),
+    Method(
+        *("plasticity_injection", "ppo_plasticity_injection", PPO, "Plasticity injection", "gold", PLASTICITY_PAGE),
+        callbacks=(PlasticityInjection,),
+        policy=InjectionPolicy,
+        grid={"timestep": [160_000, 320_000, 640_000]},  # the first switch of Gym Control's tasks, and later ones
+    ),
+    Method(
+        *("normalize_and_project", "ppo_normalize_and_project", PPO, "Normalize and project", "navy", OPTIMIZER_PAGE),
+        optimizer_class=NormalizeAndProject,
+        optimizer_kwargs={"n_output_layers": 2},
+        callbacks=(OptimizerMetrics,),
+        policy=LayerNormPolicy,
+    ),
+    Method(
+        *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
+        policy=FourierPolicy,
+        policy_kwargs={"activation_fn": FourierFeatures},
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),

@@ -1,4 +1,4 @@
-"""Activation functions: a list of those of torch, and concatenated ReLU."""
+"""Activation functions: a list of those of torch, concatenated ReLU, and sines with cosines."""
 
 import torch as th
 from torch import nn
@@ -43,3 +43,24 @@ class CReLU(nn.Module):
         :return: ``(batch_size, 2 * n_units, ...)``
         """
         return th.cat([inputs, -inputs], dim=1).relu()
+
+
+class FourierFeatures(nn.Module):
+    """
+    Deep Fourier features, ``[sin(x), cos(x)]``: twice as many features as units. Where the one is saturated, the other is
+    close to linear, so a unit always passes a gradient.
+
+    "Plastic Learning with Deep Fourier Features", Lewandowski et al. (2024), https://arxiv.org/abs/2410.20634. It is assumed
+    here that all hidden layers have them, without a factor on the inputs or the features. To compare networks of as many
+    features, halve the number of units.
+    """
+
+    # Features for each unit
+    expansion = 2
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: ``(batch_size, n_units, ...)``
+        :return: ``(batch_size, 2 * n_units, ...)``
+        """
+        return th.cat([inputs.sin(), inputs.cos()], dim=1)

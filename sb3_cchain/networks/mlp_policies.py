@@ -1,4 +1,4 @@
-"""SB3's MLP policies with LayerNorm or with CReLU."""
+"""SB3's MLP policies with LayerNorm, with CReLU or with deep Fourier features."""
 
 from typing import Any, ClassVar
 
@@ -7,7 +7,7 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
-from sb3_cchain.networks.activations import CReLU
+from sb3_cchain.networks.activations import CReLU, FourierFeatures
 
 
 def hidden_layers(
@@ -18,7 +18,8 @@ def hidden_layers(
 
     :param n_inputs: Number of inputs
     :param net_arch: Units of each layer
-    :param activation_fn: Makes the activation; with :class:`CReLU` a layer has twice as many outputs as units
+    :param activation_fn: Makes the activation; with :class:`CReLU` and
+        :class:`FourierFeatures` a layer has twice as many outputs as units
     :param layer_norm: Whether there is a LayerNorm before each activation
     :return: The modules, and the number of outputs of the last one
     """
@@ -74,6 +75,19 @@ class CReLUPolicy(_MlpVariant):
         super().__init__(*args, **{"activation_fn": CReLU, **kwargs})
 
 
+class FourierPolicy(_MlpVariant):
+    """
+    SB3's ``MlpPolicy`` for PPO and A2C with :class:`FourierFeatures` as activation: a layer of ``n`` units in ``net_arch`` has
+    ``2 n`` outputs, as with :class:`CReLUPolicy`.
+
+    :param args: Arguments of ``ActorCriticPolicy``
+    :param kwargs: Keyword arguments of ``ActorCriticPolicy``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"activation_fn": FourierFeatures, **kwargs})
+
+
 class _QNetworkVariant(QNetwork):
     def __init__(self, *args: Any, layer_norm: bool, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -112,3 +126,15 @@ class CReLUDQNPolicy(_DQNVariant):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"activation_fn": CReLU, **kwargs})
+
+
+class FourierDQNPolicy(_DQNVariant):
+    """
+    SB3's ``MlpPolicy`` for DQN with :class:`FourierFeatures` as activation, as in :class:`FourierPolicy`.
+
+    :param args: Arguments of ``DQNPolicy``
+    :param kwargs: Keyword arguments of ``DQNPolicy``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"activation_fn": FourierFeatures, **kwargs})
