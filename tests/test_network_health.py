@@ -19,7 +19,7 @@ from sb3_cchain.analysis import NetworkHealth
 from sb3_cchain.analysis.health import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.methods import L2Init, ReDo
-from sb3_cchain.networks import CReLU, CReLUPolicy
+from sb3_cchain.networks import CReLU, CReLUPolicy, FourierFeatures, FourierPolicy
 from tests.envs import RandomEnv
 from tests.method_models import ALGORITHMS, go_on, make_model, make_random_env, parameters
 
@@ -150,6 +150,15 @@ def test_of_crelu_by_hand():
     # One half or the other of the first unit is active, none of the second
     assert health["active_share"] == health["dormant_share"] == 0.5
     # Features (1, 0, 0, 0) and (0, 0, 1, 0)
+    assert health["feature_effective_rank/mlp_extractor.policy_net"] == pytest.approx(2.0)
+
+
+def test_of_fourier_features_by_hand():
+    model = make_tiny_model(FourierPolicy, net_arch=dict(pi=[2], vf=[]), activation_fn=FourierFeatures)
+    set_weights(model.policy, mlp_extractor_policy_net_0_weight=[[th.pi / 2, 0.0], [0.0, 0.0]])
+    health = network_health(model, th.tensor([[1.0, 0.0], [-1.0, 0.0]]))
+    # Features (1, 0, 0, 1) and (-1, 0, 0, 1)
+    assert health["dormant_share"] == 0.5 and "active_share" not in health
     assert health["feature_effective_rank/mlp_extractor.policy_net"] == pytest.approx(2.0)
 
 

@@ -15,7 +15,7 @@ from torch import nn
 from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.metrics.rank import effective_rank, singular_values, srank
-from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU
+from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, RECTIFIERS, CReLU, FourierFeatures
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.forward_hooks import forward_hooks
@@ -43,7 +43,8 @@ def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 
       :math:`h_i(x) > 0`; only for ReLU, ReLU6 and CReLU. Fraction of active units (FAU) in Ma et al. (ICLR 2024),
       https://arxiv.org/abs/2310.07418.
 
-    A unit of CReLU has a positive and a negative part, and :math:`h_i` is their sum.
+    A unit of CReLU has a positive and a negative part, and :math:`h_i` is their sum. The sines and cosines of FourierFeatures
+    count as units of their own.
 
     Figures of the features of a group, the outputs :math:`\Phi` of its last activation function, ``(n_observations,
     n_features)``, flattened where they have positions, neither centred nor normalised:
@@ -150,7 +151,9 @@ def _group(name: str) -> str:
 
 def _activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Tensor]]:
     """The hidden outputs of each activation function, ``(n_observations, n_units, ...)``, in the order of their first use."""
-    names = {m: name for name, m in policy.named_modules() if isinstance(m, (*ELEMENTWISE_ACTIVATIONS, CReLU))}
+    names = {
+        m: name for name, m in policy.named_modules() if isinstance(m, (*ELEMENTWISE_ACTIVATIONS, CReLU, FourierFeatures))
+    }
     activations: dict[str, list[th.Tensor]] = {}
 
     def watch(forward: Callable[[], Any]) -> Any:
