@@ -8,7 +8,7 @@ from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_cchain import CChainPPO, DoubleDQN, TaskSignal, TrainingCheckpoint, resume
+from sb3_cchain import CChainPPO, ContinualMetrics, DoubleDQN, TaskSignal, TrainingCheckpoint, resume
 from sb3_cchain.callbacks import OverallSchedule, TaskSchedule
 from tests.envs import CountEnv
 from tests.method_models import OFF_POLICY, ON_POLICY
@@ -164,3 +164,21 @@ def test_one_callback_moves_schedules(second):
     model = PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, device="cpu")
     with pytest.raises(ValueError, match="was given OverallSchedule and "):
         model.learn(64, [TaskSignal(switch_every=64), OverallSchedule(128), second()])
+
+
+@pytest.mark.parametrize(
+    "learning_rate, schedule, warned",
+    [
+        (LinearSchedule(1e-3, 0.0, 1.0), [], True),
+        (LinearSchedule(1e-3, 0.0, 1.0), [OverallSchedule], False),
+        (1e-3, [], False),
+    ],
+)
+def test_stock_models_are_warned_of_schedules_that_end_in_each_call(learning_rate, schedule, warned):
+    model = PPO("MlpPolicy", "CartPole-v1", learning_rate=learning_rate, n_steps=32, batch_size=32, device="cpu")
+    for call in range(2):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model.learn(64, [TaskSignal(), ContinualMetrics(), *(kind(256) for kind in schedule)], reset_num_timesteps=False)
+        found = [warning for warning in caught if "goes to 0 within each" in str(warning.message)]
+        assert len(found) == (1 if warned and call == 1 else 0)

@@ -31,6 +31,8 @@ class OverallSchedule(BaseCallback):
     :raises ValueError: When it is not a positive integer. When training starts, for a second callback that moves schedules
     """
 
+    moves_schedules = True
+
     def __init__(self, total_timesteps: int):
         super().__init__()
         check_number("total_timesteps", total_timesteps, 1, integer=True)
@@ -65,6 +67,8 @@ class TaskSchedule(TaskBoundary):
     :raises ValueError: When it is not a positive integer. When training starts, for a second callback that moves schedules
     """
 
+    moves_schedules = True
+
     def __init__(self, steps_per_task: int):
         super().__init__()
         check_number("steps_per_task", steps_per_task, 1, integer=True)
@@ -92,7 +96,7 @@ class TaskSchedule(TaskBoundary):
 
 def _require_one(callback: BaseCallback) -> None:
     given = iterate_callbacks(callback.locals.get("callback"))
-    names = [type(each).__name__ for each in given if isinstance(each, (OverallSchedule, TaskSchedule))]
+    names = [type(each).__name__ for each in given if getattr(each, "moves_schedules", False)]
     if len(names) > 1:
         raise ValueError(
             f"`learn()` was given {' and '.join(names)}, which both move schedules: give it one"
