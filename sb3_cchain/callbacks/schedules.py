@@ -98,9 +98,7 @@ def _require_one(callback: BaseCallback) -> None:
     given = iterate_callbacks(callback.locals.get("callback"))
     names = [type(each).__name__ for each in given if getattr(each, "moves_schedules", False)]
     if len(names) > 1:
-        raise ValueError(
-            f"`learn()` was given {' and '.join(names)}, which both move schedules: give it one"
-        )
+        raise ValueError(f"`learn()` was given {' and '.join(names)}, which both move schedules: give it one")
 
 
 def _put_in(hooks: TrainingHooks, model: BaseAlgorithm, progress: Callable[[], float]) -> None:
