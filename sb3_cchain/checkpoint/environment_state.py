@@ -86,7 +86,7 @@ def vec_env_parts(env: VecEnv, prefix: str = "") -> VecEnvParts:
     :param prefix: What names begin with
     :return: The objects that have state in this process
     """
-    layers = {f"{prefix}{name}": layer for name, layer in _vec_layers(env).items()}
+    layers = {f"{prefix}{name}": layer for name, layer in named_layers(env).items()}
     # A monitor counts from its start in its file
     skip: dict[str, Collection[str]] = {
         name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()
@@ -151,13 +151,23 @@ def restore_remotes(env: VecEnv, states: Sequence[ObjectStates]) -> None:
         remote.recv()
 
 
-def _vec_layers(env: VecEnv) -> dict[str, VecEnv]:
-    """The vectorised environment and its wrappers, from the outside to the inside, without those that only film."""
-    found = [env]
-    while isinstance(env, VecEnvWrapper):
-        env = env.venv
-        found.append(env)
-    kept = [layer for layer in found if not isinstance(layer, VecVideoRecorder)]
+def env_layers(env: VecEnv) -> list[VecEnv]:
+    """
+    :param env: A vectorised environment
+    :return: It and what it wraps, from the outside to the inside
+    """
+    layers = [env]
+    while isinstance(layers[-1], VecEnvWrapper):
+        layers.append(layers[-1].venv)
+    return layers
+
+
+def named_layers(env: VecEnv) -> dict[str, VecEnv]:
+    """
+    :param env: A vectorised environment
+    :return: Its layers by names, without those that only film
+    """
+    kept = [layer for layer in env_layers(env) if not isinstance(layer, VecVideoRecorder)]
     return {f"{position} {type(layer).__name__}": layer for position, layer in enumerate(kept)}
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_cchain.checkpoint.environment_state import named_layers
 from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.tasks.signal import is_continual
 
@@ -72,12 +72,7 @@ def _end_last_episodes(buffer: ReplayBuffer) -> None:
 
 
 def _wrappers(env: VecEnv) -> dict[str, VecEnv]:
-    found = []
-    while isinstance(env, VecEnvWrapper):
-        found.append(env)
-        env = env.venv
-    kept = [wrapper for wrapper in found if not isinstance(wrapper, VecVideoRecorder)]
-    return {f"{position} {type(wrapper).__name__}": wrapper for position, wrapper in enumerate(kept)}
+    return {name: layer for name, layer in named_layers(env).items() if layer is not env.unwrapped}
 
 
 def _known(env: VecEnv) -> dict[str, object]:

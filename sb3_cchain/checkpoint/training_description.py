@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+from sb3_cchain.checkpoint.environment_state import env_layers
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv, describe_single_environment
 
 # Arguments that do not change what is learned, are described by themselves, or are changed by callbacks
@@ -48,22 +49,19 @@ def describe_env(env: VecEnv) -> dict[str, str]:
     :param env: A vectorised environment
     :return: What it is made of, and its spaces
     """
-    layers, layer = [type(env).__name__], env
-    while hasattr(layer, "venv"):
-        layer = layer.venv
-        layers.append(type(layer).__name__)
+    *wrappers, layer = env_layers(env)
     if isinstance(layer, DummyVecEnv):
         name = describe_single_environment(layer.envs[0])
     elif isinstance(layer, SubprocVecEnv) and all(env.env_is_wrapped(ResumableEnv)):
         name = env.env_method("description", indices=0)[0]
     else:  # not made of single environments, or out of reach
-        name = layers[-1]
+        name = type(layer).__name__
     return {
         "environment": name,
         "number of environments": str(env.num_envs),
         "observation space": str(env.observation_space),
         "action space": str(env.action_space),
-        "vectorised wrappers": ", ".join(layers[:-1]) or "none",
+        "vectorised wrappers": ", ".join(type(wrapper).__name__ for wrapper in wrappers) or "none",
     }
 
 

@@ -2,7 +2,7 @@
 
 import pickle
 import random
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.environment_state import (
     VecEnvParts,
     check_same_environment,
+    env_layers,
     remote_states,
     restore_remotes,
     vec_env_parts,
@@ -110,17 +111,6 @@ def _arguments(callback: BaseCallback) -> dict[str, bytes]:
             with suppress(Exception):  # whatever the code of an object raises
                 found[name] = pickle.dumps(value, protocol=5)
     return found
-
-
-def env_layers(env: VecEnv) -> Iterator[VecEnv]:
-    """
-    :param env: A vectorised environment
-    :return: It and what it wraps, from outside to inside
-    """
-    yield env
-    while hasattr(env, "venv"):
-        env = env.venv
-        yield env
 
 
 def _is_other_env(value: object, env: VecEnv) -> bool:
