@@ -4,6 +4,7 @@ folder for each run. The same command goes on where it was interrupted.
 
     python -m benchmarks.run --suite gym_control --budget reduced --dry-run
     python -m benchmarks.run --suite gym_control --budget reduced
+    python -m benchmarks.run --suite shelf --dry-run
     python -m benchmarks.run --suite all --address auto --gpus-per-run 0.25
 """
 
@@ -21,7 +22,7 @@ from rich.console import Console
 
 from benchmarks.grid.attempts import PACKAGES, newest_checkpoint
 from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
-from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs
+from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs, shelf_runs
 from benchmarks.grid.results import find_result, read_result, read_results
 from benchmarks.grid.run import Run
 from benchmarks.grid.suites import SUITES
@@ -38,7 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     paper_seeds = ", ".join(f"{suite.n_paper_seeds} in {name}" for name, suite in SUITES.items())
     fewer_seeds = ", ".join(f"{n} in {budget}" for budget, n in N_SEEDS.items())
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--suite", required=True, choices=[*SUITES, "all"], help="Suite")
+    parser.add_argument(
+        "--suite",
+        required=True,
+        choices=[*SUITES, "shelf", "all"],
+        help="Suite; shelf: all methods of the registry, in two environments of Gym Control at the budget reduced",
+    )
     parser.add_argument("--env", nargs="+", help="Environment ids, by default all of the suite")
     parser.add_argument(
         "--method",
@@ -51,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=int,
         help=f"Number of seeds; by default the paper's ({paper_seeds}); of the other budgets {fewer_seeds}",
     )
-    parser.add_argument("--budget", default="paper", choices=BUDGETS, help="Length of the runs")
+    parser.add_argument("--budget", choices=BUDGETS, help="Length of the runs, by default the paper's; reduced for the shelf")
     parser.add_argument("--dry-run", action="store_true", help="List the runs and what they will cost, and train nothing")
     parser.add_argument("--address", help="Address of a Ray cluster; by default this machine alone, without Ray")
     parser.add_argument("--cpus", type=int, help="Runs at a time on this machine, by default one per core")
@@ -67,7 +73,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     console = Console()
     try:
-        grid = grid_runs(list(SUITES) if args.suite == "all" else [args.suite], args.env, args.method, args.seeds, args.budget)
+        if args.suite == "shelf":
+            grid = shelf_runs(args.env, args.method, args.seeds, args.budget or "reduced")
+        else:
+            suites = list(SUITES) if args.suite == "all" else [args.suite]
+            grid = grid_runs(suites, args.env, args.method, args.seeds, args.budget or "paper")
         if args.dry_run:
             list_grid(grid, args.results, args.logs, console)
             return 0

@@ -17,7 +17,7 @@ from benchmarks.family import cases as family
 from benchmarks.grid.run import ROOT
 from benchmarks.grid.suites import SUITES
 from benchmarks.speed import __main__ as speed
-from benchmarks.speed import big_rollout, cases, memory, sbx_ppo
+from benchmarks.speed import big_rollout, cases, gpu, memory, sbx_ppo
 from benchmarks.speed.checkpoint_cost import measure_share
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
@@ -211,8 +211,22 @@ def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
     of_family = [f"family_{name}" for name in family.CASES]
     of_family += ["family_evidence", *(f"falls_{name}" for name, case in family.CASES.items() if case.solved is not None)]
-    assert sorted(places) == sorted(["made_with", *speed.CASES, *speed.OTHERS, *of_family])
+    others = ["made_with", "gpu", "shelf"]
+    assert sorted(places) == sorted([*others, *speed.CASES, *speed.OTHERS, *of_family])
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
+
+
+def test_updates_are_timed_on_each_device(monkeypatch):
+    def make(device):
+        yield "base", lambda: times.append(1.0)
+        yield "other", lambda: times.append(3.0)
+
+    times = []
+    monkeypatch.setattr(gpu, "CASES", {"a case": make})
+    monkeypatch.setattr(gpu, "wall_clock", lambda call, device: call() or times[-1])
+    table = gpu.gpu_table(2, ("cpu",))
+    assert table.header == ["", "", "cpu, seconds", "cpu, time / base"]
+    assert table.rows == [["a case", "base", "1", "1"], ["a case", "other", "3", "3.00 (3.00 to 3.00)"]]
 
 
 @pytest.mark.parametrize("algorithm, algo", [(PPO, "ppo"), (CChainPPO, "ppo_cchain")])

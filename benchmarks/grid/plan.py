@@ -3,13 +3,18 @@
 from collections.abc import Iterable, Sequence
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, split_line
+from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, split_line, suite_methods
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
 
 BUDGETS = ("paper", "reduced", "smoke")
 # Seeds of a budget; the paper's own stand in the suite's row
 N_SEEDS = {"reduced": 3, "smoke": 1}
+
+# Where all methods of the registry are compared with each other, those of the paper and the others
+SHELF_SUITE = "gym_control"
+SHELF_ENVS = ("Continual/Acrobot-v1", "Continual/LunarLander-v3")
+SHELF_SEEDS = 2
 
 
 def run_length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
@@ -71,6 +76,26 @@ def grid_runs(
             f"--method must be one with hyperparameters for {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
         )
     return [run for *_, run in sorted(grid, key=lambda entry: entry[:2])]
+
+
+def shelf_runs(
+    env_ids: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    n_seeds: int | None = None,
+    budget: str = "reduced",
+) -> list[Run]:
+    """
+    All methods that there are, beside each other: the arguments narrow it down.
+
+    :param env_ids: Environments, by default ``SHELF_ENVS``
+    :param methods: Methods, by default all that have hyperparameters there
+    :param n_seeds: Number of seeds, by default ``SHELF_SEEDS``
+    :param budget: One of ``BUDGETS``
+    :return: As :func:`grid_runs`
+    :raises ValueError: As :func:`grid_runs`
+    """
+    methods = methods or list(suite_methods(SHELF_SUITE))
+    return grid_runs([SHELF_SUITE], env_ids or SHELF_ENVS, methods, n_seeds or SHELF_SEEDS, budget)
 
 
 def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:

@@ -1,0 +1,47 @@
+"""The command ``benchmarks.shelf``, on scores written by hand."""
+
+import pytest
+
+from benchmarks import shelf
+from benchmarks.grid.plan import SHELF_ENVS, shelf_runs
+from benchmarks.grid.run import ROOT, suite_methods
+
+METHODS = {name: suite_methods("gym_control")[name] for name in ("vanilla", "trac", "cchain", "crelu")}
+# CReLU has no run, TRAC one environment alone
+SCORES = {
+    "Continual/Acrobot-v1": {"vanilla": [-300.0, -100.0], "trac": [-90.0], "cchain": [-110.0, -112.0]},
+    "Continual/LunarLander-v3": {"vanilla": [-300.0], "trac": [], "cchain": [-40.0]},
+}
+
+
+def test_the_runs_of_the_shelf():
+    runs = shelf_runs()
+    assert {run.env_id for run in runs} == set(SHELF_ENVS) and {run.seed for run in runs} == {0, 1}
+    assert {run.method for run in runs} == set(suite_methods("gym_control"))
+    assert all((run.n_tasks, run.steps_per_task, run.experiment) == (4, 64_000, "reduced") for run in runs)
+    (run,) = shelf_runs(["Continual/Acrobot-v1"], ["trac"], 1, "smoke")
+    assert (run.method, run.experiment) == ("trac", "smoke")
+
+
+def test_a_table_from_the_best_to_the_worst():
+    rows = [line.strip("| ").split(" | ") for line in shelf.shelf_table(SCORES, {"TRAC": 1.284}, METHODS).splitlines()]
+    assert rows[0] == ["method", "Acrobot-v1, by seed", "mean", "LunarLander-v3, by seed", "mean", "time / PPO"]
+    assert rows[2:] == [
+        ["C-CHAIN PPO", "-110 -112", "-111", "-40", "-40", "–"],
+        ["PPO", "-300 -100", "-200", "-300", "-300", "–"],
+        ["TRAC", "-90", "-90", "–", "–", "1.28"],
+        ["CReLU", "–", "–", "–", "–", "–"],
+    ]
+
+
+def test_the_committed_results_are_read(tmp_path):
+    scores = shelf.read_scores(shelf_runs(methods=["vanilla"]), ROOT / "benchmarks/results")
+    assert {env_id: len(of_env["vanilla"]) for env_id, of_env in scores.items()} == dict.fromkeys(SHELF_ENVS, 2)
+    costs = shelf.read_costs(ROOT / "docs" / shelf.COSTS)
+    assert costs["PPO"] == 1 and 0.5 < costs["TRAC"] < 3
+
+
+def test_a_picture(tmp_path):
+    pytest.importorskip("matplotlib")
+    shelf.plot(SCORES, {"TRAC": 1.3}, METHODS, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
