@@ -173,6 +173,9 @@ DIFFERENCES = {
         optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-8, fused=True)"),
     ),
     ("ppo_l2_init", "procgen"): (METRICS, optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-5)")),
+    ("ppo_layer_norm", "gym_control"): ([], ADAM),
+    ("ppo_redo", "gym_control"): ([REDO], ADAM),
+    ("ppo_adam_rel", "gym_control"): (["sb3_cchain.methods.AdamRel"], ADAM),
     ("ppo_layer_norm", "procgen"): ([], "features_extractor_kwargs=dict(layer_norm=True)"),
     ("ppo_redo", "procgen"): ([REDO], ""),
     ("ppo_adam_rel", "procgen"): (["sb3_cchain.methods.AdamRel"], ""),
@@ -226,6 +229,8 @@ def test_the_papers_methods_have_these_settings(method):
                 "callback": [*env_settings["callback"], *callbacks],
                 "policy_kwargs": policy_kwargs,
             }
+            if (method, suite) == ("ppo_layer_norm", "gym_control"):
+                expected[env_id]["policy"] = "sb3_cchain.networks.LayerNormPolicy"
     covered = {env_id: env_settings for env_id, env_settings in settings.items() if not env_id.endswith("-defaults")}
     assert {env_id: parsed(env_settings) for env_id, env_settings in covered.items()} == {
         env_id: parsed(env_settings) for env_id, env_settings in expected.items()
@@ -268,12 +273,11 @@ def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, 
     )
 
 
-@pytest.mark.parametrize("algo", ["ppo_layer_norm", "double_dqn_oracle"])
-def test_a_method_says_which_environments_it_covers(tmp_path, algo):
-    covered = PROCGEN if algo == "ppo_layer_norm" else ENV_IDS["minatar"]
-    error = f"{algo}.yml has no settings for Continual/Acrobot-v1, only for {', '.join(covered)}. .* -conf FILE$"
+@pytest.mark.parametrize("algo, suite", [("ppo_parseval", "gym_control"), ("double_dqn_oracle", "minatar")])
+def test_a_method_says_which_environments_it_covers(tmp_path, algo, suite):
+    error = f"{algo}.yml has no settings for CartPole-v1, only for {', '.join(ENV_IDS[suite])}. .* -conf FILE$"
     with pytest.raises(SystemExit, match=error):
-        train(tmp_path, algo, "Continual/Acrobot-v1", 64)
+        train(tmp_path, algo, "CartPole-v1", 64)
     assert not list(tmp_path.iterdir())
 
 
@@ -284,7 +288,7 @@ def test_a_method_without_a_yaml_file_says_so(monkeypatch, tmp_path):
 
 
 def test_the_file_of_the_user_for_a_method():
-    arguments = ["--algo", "ppo_redo", "--env", "Continual/CartPole-v1", "-conf", "mine.yml"]
+    arguments = ["--algo", "ppo_redo", "--env", "CartPole-v1", "-conf", "mine.yml"]
     assert add_settings_file(arguments) == arguments
 
 
