@@ -13,7 +13,7 @@ from torch import nn
 from sb3_cchain import CChainCallback
 from sb3_cchain.methods import L2Init, ReDo, WeightClipping
 from sb3_cchain.methods.hidden_units import find_hidden_units
-from sb3_cchain.methods.redo import recycle_units
+from sb3_cchain.methods.unit_recycling import recycle_units
 from sb3_cchain.networks import LayerNormPolicy
 from sb3_cchain.networks.extractors import MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
