@@ -25,12 +25,11 @@ class L2Init(Penalty):
 
     Paper: https://arxiv.org/abs/2308.11958 (Kumar et al., 2023). Its equation has the sum over all entries, which is the
     default here. Its code (https://github.com/skumar9876/L2_Init) has half of that sum and leaves out the parameters of
-    LayerNorm, as ``exclude_norms=True`` does. By default all parameters of the optimiser are included; those of target networks
-    are not among them.
+    LayerNorm, as ``exclude_norms=True`` does. By default all parameters of the optimiser are included; those of target
+    networks are not among them.
 
-    The scale of c: it multiplies the squares of all entries together, and is added to a loss that is a mean over the minibatch,
-    so the same c means the same pull on each entry for any batch size and, with the sum, for any size of the network; with
-    the mean the pull is as many times weaker as there are entries.
+    The scale of c: beside a loss that is a mean over the minibatch, the gradient of an entry is 2c(θ − θ₀) with the sum,
+    whatever the batch size and the size of the network, and that divided by the number of entries with the mean.
 
     The C-CHAIN paper takes the best c of 0.1, 1, 10, 100 and 1000. It does not say whether c multiplies a sum or a mean, and
     the code of that comparison is not public. L2 Init's own code tries 1e-5 … 1e-2 of half the sum. With the 270 000 entries
@@ -49,7 +48,7 @@ class L2Init(Penalty):
     :param towards: ``"init"``, or ``"zero"`` for plain L2 regularisation
     :param reduction: ``"sum"`` of the squares over all entries of all parameters, or their ``"mean"``
     :param exclude_norms: Whether weights and biases of normalisations are left out of the sum and the mean. An optimiser knows
-        parameters only by their order: they are taken to be the vectors behind a layer's bias, so layers need biases
+        parameters only by their order: they are taken to be the vectors behind a layer's bias, so each layer needs one bias
     :param kwargs: ``base_class`` and ``base_kwargs``, as for :class:`~sb3_cchain.methods.OptimizerWrapper`
     :raises ValueError: Naming the argument that is out of its range
     :raises TypeError: When ``exclude_norms`` is not a boolean
@@ -84,7 +83,7 @@ class L2Init(Penalty):
             return [True] * len(self.parameters())
         dims = [parameter.dim() for parameter in self.parameters()]
         # Behind a matrix comes its bias, and then what belongs to a normalisation
-        return [not (i > 1 and dims[i] == dims[i - 1] == 1 and max(dims[:i]) > 1) for i in range(len(dims))]
+        return [not (i > 0 and dims[i] == dims[i - 1] == 1 and max(dims[:i]) > 1) for i in range(len(dims))]
 
     def _penalised(self) -> list[th.Tensor]:
         return [parameter for parameter, is_in in zip(self.parameters(), self._included(), strict=True) if is_in]
