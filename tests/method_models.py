@@ -32,6 +32,7 @@ CALLBACK_ARGUMENTS = {
     "ReDo": dict(tau=0.3, interval=1),
     "ReGraMa": dict(tau=0.5, interval=1),
     "SelfNormalizedResets": dict(max_threshold=2, update_interval=2, interval=1),
+    "FIRE": dict(interval=16),
     "LayerReset": dict(n_layers=1, interval=16),
     "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),

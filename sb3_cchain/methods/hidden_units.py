@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_cchain.analysis.metrics.dormancy import mean_activity
-from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU
+from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU, FourierFeatures
 from sb3_cchain.networks.forward_hooks import forward_hooks
 
 
@@ -65,7 +65,7 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
             arrived[module] = _channels_last(module, inputs[0])
             tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
             return tagged.clone()  # for activations that write into their inputs
-        if isinstance(module, CReLU):
+        if isinstance(module, (CReLU, FourierFeatures)):
             return th.cat([inputs[0], inputs[0]], dim=1)
         if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
             arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
