@@ -87,9 +87,9 @@ def test_each_pair_trains_or_is_refused(number):
                 model, callbacks = compose(one, other, algorithm)
                 model.learn(8, callback=[TaskSync(), *callbacks])
             continue
-        model, callbacks = compose(one, other, algorithm)
-        before = parameters(model)
         try:
+            model, callbacks = compose(one, other, algorithm)
+            before = parameters(model)
             model.learn(32, callback=[TaskSync(), *callbacks], log_interval=1000)
         except Exception as error:
             pytest.fail(f"{names} neither go together in {algorithm} nor are they in REFUSED: {error!r}")

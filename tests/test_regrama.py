@@ -65,6 +65,16 @@ def test_scores_are_of_all_updates_since_the_last_recycling(name):
         assert regrama.n_recycled >= len(recycled)  # of the critic as well
 
 
+def test_scores_begin_again_after_a_recycling():
+    """A unit that got its last gradient before it."""
+    model = make_model("PPO", env=make_random_env(), policy_kwargs=NET, learning_rate=0.0, n_epochs=1)
+    gradients = GiveGradients(HIDDEN["PPO"], [[1.0, 1.0, 1.0]] * 2 + [[1.0, 1.0, 0.0]] * 2)
+    before = parameters(model)[f"{HIDDEN['PPO']}.weight"]
+    model.learn(32, callback=[gradients, ReGraMa(tau=0.0, interval=1)])
+    after = parameters(model)[f"{HIDDEN['PPO']}.weight"]
+    assert (before != after).any(dim=1).tolist() == [False, False, True]
+
+
 def test_active_units_that_are_saturated_are_found():
     """Tanh of a large input, which ReDo's activations do not tell."""
     model = make_model("PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[4]))
