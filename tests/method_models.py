@@ -28,7 +28,11 @@ OPTIMIZER_ARGUMENTS = {
     "Parseval": dict(coef=0.1),
 }
 CALLBACK_ARGUMENTS = {
+    "ContinualBackprop": dict(replacement_rate=0.1, maturity_threshold=2),
     "ReDo": dict(tau=0.3, interval=1),
+    "ReGraMa": dict(tau=0.5, interval=1),
+    "SelfNormalizedResets": dict(max_threshold=2, update_interval=2, interval=1),
+    "FIRE": dict(interval=16),
     "LayerReset": dict(n_layers=1, interval=16),
     "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),

@@ -1,7 +1,9 @@
 """The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm; the table of all methods."""
 
 from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.continual_backprop import ContinualBackprop
 from sb3_cchain.methods.exploration import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
+from sb3_cchain.methods.fire import FIRE
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
@@ -12,13 +14,17 @@ from sb3_cchain.methods.parseval import Parseval
 from sb3_cchain.methods.penalty import Penalty
 from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
+from sb3_cchain.methods.regrama import ReGraMa
+from sb3_cchain.methods.self_normalized_resets import SelfNormalizedResets
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.weight_clipping import WeightClipping
 
 __all__ = [
+    "FIRE",
     "TRAC",
     "AdamRel",
+    "ContinualBackprop",
     "EntropyBonusRestart",
     "ExplorationRateRestart",
     "L2Init",
@@ -32,6 +38,8 @@ __all__ = [
     "Penalty",
     "PlasticityInjection",
     "ReDo",
+    "ReGraMa",
+    "SelfNormalizedResets",
     "ShrinkAndPerturb",
     "WeightClipping",
 ]

@@ -17,6 +17,8 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_cchain.algorithms import CChainA2C, CChainDDPG, CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.continual_backprop import ContinualBackprop
+from sb3_cchain.methods.fire import FIRE
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
@@ -26,6 +28,8 @@ from sb3_cchain.methods.oracle import Oracle
 from sb3_cchain.methods.parseval import Parseval
 from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
+from sb3_cchain.methods.regrama import ReGraMa
+from sb3_cchain.methods.self_normalized_resets import SelfNormalizedResets
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.weight_clipping import WeightClipping
@@ -188,6 +192,27 @@ REGISTRY = (
         *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
         policy=FourierPolicy,
         policy_kwargs={"activation_fn": FourierFeatures},
+    ),
+    Method(
+        *("continual_backprop", "ppo_continual_backprop", PPO, "Continual backprop", "darkgreen", PLASTICITY_PAGE),
+        callbacks=(ContinualBackprop,),
+        grid={"replacement_rate": [1e-5, 1e-4, 1e-3], "maturity_threshold": [1000, 10_000]},  # a decade around the paper's
+    ),
+    Method(
+        *("regrama", "ppo_regrama", PPO, "ReGraMa", "darkorchid", PLASTICITY_PAGE),
+        callbacks=(ReGraMa,),
+        # τ: the paper's, units without any gradient, and ten times the paper's. Interval in iterations, as of ReDo
+        grid={"tau": [0.0, 0.01, 0.1], "interval": [1, 10, 100]},
+    ),
+    Method(
+        *("self_normalized_resets", "ppo_self_normalized_resets", PPO, "Self-normalized resets", "sienna", PLASTICITY_PAGE),
+        callbacks=(SelfNormalizedResets,),
+        grid={"eta": [0.01, 0.02, 0.04, 0.08]},
+    ),
+    Method(
+        *("fire", "ppo_fire", PPO, "FIRE", "orangered", PLASTICITY_PAGE),
+        callbacks=(FIRE,),
+        grid={"n_iterations": [5, 10]},
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
