@@ -26,6 +26,7 @@ OPTIMIZER_ARGUMENTS = {
     "WeightClipping": dict(clip_ratio=0.5),
     "L2Init": dict(coef=0.1, base_kwargs=dict(fused=True)),
     "Parseval": dict(coef=0.1),
+    "UPGD": dict(sigma=0.1),
 }
 CALLBACK_ARGUMENTS = {
     "ReDo": dict(tau=0.3, interval=1),
@@ -33,7 +34,8 @@ CALLBACK_ARGUMENTS = {
     "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),
 }
-OPTIMIZERS = {method.name: method for method in REGISTRY if method.optimizer_class is not None}
+# Kron has no optimiser inside, and neither metrics nor a step count; tests/test_kron.py tests it
+OPTIMIZERS = {method.name: method for method in REGISTRY if method.optimizer_class is not None and method.name != "kron"}
 CALLBACKS = list(dict.fromkeys(cls for m in REGISTRY if m.optimizer_class is None for cls in m.callbacks))
 
 

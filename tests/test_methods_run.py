@@ -33,6 +33,9 @@ ALL_KEYS = {
     "l2_init/distance",
     "parseval/loss",
     "normalize_and_project/norm",
+    "ewc/loss",
+    "upgd/greatest_utility",
+    "muon/share",
 }
 
 
