@@ -34,8 +34,8 @@ CALLBACK_ARGUMENTS = {
     "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),
 }
-# Kron has no optimiser inside, and neither metrics nor a step count; tests/test_kron.py tests it
-OPTIMIZERS = {method.name: method for method in REGISTRY if method.optimizer_class is not None and method.name != "kron"}
+# Those that go around others. tests/test_kron.py tests the other one
+OPTIMIZERS = {m.name: m for m in REGISTRY if m.optimizer_class is not None and m.optimizer_class.has_arguments_of_base}
 CALLBACKS = list(dict.fromkeys(cls for m in REGISTRY if m.optimizer_class is None for cls in m.callbacks))
 
 

@@ -9,7 +9,8 @@ from sb3_cchain.networks import InjectionDQNPolicy, InjectionPolicy
 from tests.method_models import STEPS_PER_TASK, make_method, make_model, make_random_env, optimizer_arguments, parameters
 
 METHODS = {method.algo: method for method in REGISTRY if method.is_related}
-# Arguments with which nothing happens, of the optimiser or of the callback. TRAC, AdamRel and networks have none
+# Arguments with which nothing happens, of the optimiser or of the callback. TRAC, AdamRel, UPGD, Muon, Kron and networks have
+# none
 OFF = {
     "ppo_weight_clipping": dict(clip_ratio=1e9),
     "ppo_l2_init": dict(coef=0),
@@ -19,6 +20,7 @@ OFF = {
     "ppo_shrink_and_perturb": dict(shrink=0.5, interval=10**9),
     "ppo_layer_reset": dict(interval=10**9),
     "ppo_plasticity_injection": dict(timestep=10**9),
+    "ppo_ewc": dict(coef=0),
 }
 
 

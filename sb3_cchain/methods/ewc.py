@@ -25,8 +25,9 @@ class EWC(Penalty):
     :math:`\theta^* \leftarrow \theta`. There is no penalty before the first switch.
 
     Papers: https://arxiv.org/abs/1612.00796 (Kirkpatrick et al., PNAS 2017). One anchor :math:`\theta^*` for all tasks and the
-    decay are those of the online form, https://arxiv.org/abs/1805.06370 (Schwarz et al., ICML 2018); Continual World
-    (https://arxiv.org/abs/2105.10919, Wołczyk et al., NeurIPS 2021) compares it with :math:`\gamma = 1`.
+    decay are those of the online form, https://arxiv.org/abs/1805.06370 (Schwarz et al., ICML 2018). The code of Continual
+    World (https://arxiv.org/abs/2105.10919, Wołczyk et al., NeurIPS 2021) has :math:`\gamma = 1`, and raises the policy's
+    :math:`F` to at least 1e-5, which is not done here.
 
     Logged: ``ewc/loss``, the penalty.
 
@@ -35,7 +36,7 @@ class EWC(Penalty):
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate
-    :param coef: c, twice the coefficient of Continual World's code, which takes the best of many powers of ten for SAC
+    :param coef: c. The default is not tuned. In Continual World's code, which has no ½, the coefficient is c / 2.
     :param decay: γ, between 0 (the last task counts alone) and 1 (all tasks count alike)
     :param kwargs: ``base_class`` and ``base_kwargs``, as for :class:`~sb3_cchain.methods.OptimizerWrapper`
     :raises ValueError: Naming the argument that is out of its range

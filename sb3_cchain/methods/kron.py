@@ -42,6 +42,7 @@ class Kron(OptimizerWrapper):
     """
 
     name = "kron"
+    has_arguments_of_base = False
 
     def __init__(
         self,

@@ -37,6 +37,8 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     # Key in the state, and prefix in the log
     name: ClassVar[str]
+    # Whether there are `base_class` and `base_kwargs`
+    has_arguments_of_base: ClassVar[bool] = True
 
     def __init__(
         self,

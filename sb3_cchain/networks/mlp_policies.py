@@ -100,7 +100,8 @@ class FourierPolicy(_MlpVariant):
 class SpectralNormPolicy(_MlpVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C whose hidden layers are divided by their greatest singular value, as
-    :class:`SpectralNormLinear` describes. The output layers are not, so the outputs can grow.
+    :class:`SpectralNormLinear` describes. The output layers are not, so the outputs can grow; neither are those of a features
+    extractor.
 
     In reinforcement learning: Gogianu et al. (ICML 2021), https://arxiv.org/abs/2105.05246; Bjorck et al. (NeurIPS 2021),
     https://arxiv.org/abs/2106.01151. They normalise some of the layers; here it is all hidden ones.
