@@ -26,6 +26,7 @@ OPTIMIZER_ARGUMENTS = {
     "WeightClipping": dict(clip_ratio=0.5),
     "L2Init": dict(coef=0.1, base_kwargs=dict(fused=True)),
     "Parseval": dict(coef=0.1),
+    "SpectralRegularization": dict(coef=0.1),
     "UPGD": dict(sigma=0.1),
 }
 CALLBACK_ARGUMENTS = {

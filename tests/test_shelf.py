@@ -20,6 +20,7 @@ OFF = {
     "ppo_shrink_and_perturb": dict(shrink=0.5, interval=10**9),
     "ppo_layer_reset": dict(interval=10**9),
     "ppo_plasticity_injection": dict(timestep=10**9),
+    "ppo_spectral_regularization": dict(coef=0),
     "ppo_ewc": dict(coef=0),
 }
 

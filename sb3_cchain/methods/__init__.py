@@ -17,6 +17,7 @@ from sb3_cchain.methods.penalty import Penalty
 from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.spectral_regularization import SpectralRegularization
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.upgd import UPGD
 from sb3_cchain.methods.weight_clipping import WeightClipping
@@ -43,5 +44,6 @@ __all__ = [
     "PlasticityInjection",
     "ReDo",
     "ShrinkAndPerturb",
+    "SpectralRegularization",
     "WeightClipping",
 ]

@@ -31,6 +31,7 @@ from sb3_cchain.methods.parseval import Parseval
 from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.spectral_regularization import SpectralRegularization
 from sb3_cchain.methods.trac import TRAC
 from sb3_cchain.methods.upgd import UPGD
 from sb3_cchain.methods.weight_clipping import WeightClipping
@@ -202,6 +203,12 @@ REGISTRY = (
         *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
         policy=FourierPolicy,
         policy_kwargs={"activation_fn": FourierFeatures},
+    ),
+    Method(
+        *("spectral_regularization", "ppo_spectral_regularization", PPO, "Spectral regularisation", "tomato", OPTIMIZER_PAGE),
+        optimizer_class=SpectralRegularization,
+        callbacks=(OptimizerMetrics,),
+        grid={"coef": [1e-5, 1e-4, 1e-3, 1e-2], "power": [1, 2]},
     ),
     Method(
         *("ewc", "ppo_ewc", PPO, "EWC", "sienna", OPTIMIZER_PAGE),
