@@ -8,7 +8,9 @@ from stable_baselines3 import SAC
 from torch import nn
 
 from sb3_cchain.methods import UPGD
-from tests.method_models import OFF_POLICY
+from sb3_cchain.methods.fresh_policy import fresh_policy
+from sb3_cchain.methods.layer_reset import reset_layers
+from tests.method_models import OFF_POLICY, make_model, make_random_env
 
 
 def logistic(x):
@@ -68,11 +70,25 @@ def test_without_a_positive_utility_it_is_the_base_with_noise():
     assert weights.isfinite().all()
 
 
+def test_utilities_are_reset_with_the_moments():
+    def utility(name):
+        return model.policy.optimizer.state.get(model.policy.get_parameter(name), {}).get("utility")
+
+    policy_kwargs = dict(net_arch=[8, 8], optimizer_class=UPGD)
+    model = make_model("PPO", env=make_random_env(), policy_kwargs=policy_kwargs).learn(16)
+    hidden, output = "mlp_extractor.policy_net.2.weight", "action_net.weight"
+    kept = utility(hidden).clone()
+    reset_layers(model.policy, fresh_policy(model), 1)
+    assert utility(output) is None and th.equal(utility(hidden), kept)
+    model.learn(16)
+    assert utility(output).any()
+
+
 def test_with_sac():
     policy_kwargs = dict(net_arch=[8], optimizer_class=UPGD)
     model = SAC("MlpPolicy", "Pendulum-v1", device="cpu", **{**OFF_POLICY, "policy_kwargs": policy_kwargs}).learn(20)
     for optimizer in (model.actor.optimizer, model.critic.optimizer):
-        assert optimizer.own_state["n_updates"] == 12
+        assert all(optimizer.state[p]["n_utility_updates"] == 12 for p in optimizer.parameters())
         assert all(p.isfinite().all() for p in optimizer.parameters())
 
 

@@ -37,7 +37,8 @@ class UPGD(OptimizerWrapper):
       positive utility hardly change;
     - all parameters take part, biases included.
 
-    Where no utility is positive, the update is the base's with noise.
+    Where no utility is positive, the update is the base's with noise. Utilities are kept with the moments of the parameters,
+    and begin again with them (:class:`ReDo`, :class:`LayerReset`).
 
     Logged: ``upgd/greatest_utility``, η.
 
@@ -76,34 +77,27 @@ class UPGD(OptimizerWrapper):
         super().__init__(params, lr, **kwargs)
 
     def _step(self) -> None:
-        utilities = self._trace_utilities()
-        greatest = self.own_state["greatest_utility"] = th.stack([utility.max() for utility in utilities]).max()
-        trained = [
-            (parameter, utility, parameter.clone(), group["lr"])
-            for (group, parameter), utility in zip(self._grouped(), utilities, strict=True)
-            if parameter.grad is not None
-        ]
+        trained = [(p, group["lr"]) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        traces = [self._trace_utility(parameter) for parameter, _ in trained]
+        before = [parameter.clone() for parameter, _ in trained]
         super()._step()
-        correction = 1 - self.beta ** self.own_state["n_updates"]
-        for parameter, utility, before, lr in trained:
-            scaled = th.where(greatest > 0, utility / (correction * greatest), 0.0)
+        if not trained:
+            return
+        greatest = self.own_state["greatest_utility"] = th.stack([utility.max() for utility, _ in traces]).max()
+        for (parameter, lr), (utility, n_updates), old in zip(trained, traces, before, strict=True):
+            # With the moments, so that what resets those resets this. After the base, which makes its state where there is none
+            self.state[parameter].update(utility=utility, n_utility_updates=n_updates)
+            scaled = th.where(greatest > 0, utility / ((1 - self.beta**n_updates) * greatest), 0.0)
             gate = 2 * th.sigmoid(-scaled)  # 1 - φ(x) = φ(-x)
             noise = th.randn_like(parameter) * self.sigma
-            parameter.copy_((1 - lr * self.weight_decay) * before + gate * (parameter - before - lr * noise))
+            parameter.copy_((1 - lr * self.weight_decay) * old + gate * (parameter - old - lr * noise))
 
-    def _grouped(self) -> list[tuple[dict[str, Any], th.Tensor]]:
-        return [(group, parameter) for group in self.param_groups for parameter in group["params"]]
-
-    def _trace_utilities(self) -> list[th.Tensor]:
-        own, parameters = self.own_state, self.parameters()
-        known = own.get("utilities", [])
-        known = [*known, *map(th.zeros_like, parameters[len(known) :])]
-        own["n_updates"] = own.get("n_updates", 0) + 1
-        own["utilities"] = [
-            utility if p.grad is None else self.beta * utility.to(p.device) - (1 - self.beta) * p.grad * p
-            for p, utility in zip(parameters, known, strict=True)
-        ]
-        return own["utilities"]
+    def _trace_utility(self, parameter: th.Tensor) -> tuple[th.Tensor, int]:
+        """The utilities after this update's gradient, and the number of gradients in them."""
+        assert parameter.grad is not None
+        state = self.state.get(parameter, {})
+        utility = self.beta * state.get("utility", 0.0) - (1 - self.beta) * parameter.grad * parameter
+        return utility, state.get("n_utility_updates", 0) + 1
 
     def metrics(self) -> dict[str, float]:
         """
