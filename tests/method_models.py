@@ -91,7 +91,7 @@ def make_callback(cls):
 
 def make_method(method, with_c_chain=False):
     """The model and the callbacks of a row of the registry, with C-CHAIN in place of its algorithm if wanted."""
-    policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
+    policy_kwargs = {**method.policy_kwargs, "net_arch": [8]}
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
     algorithm = method.algorithm

@@ -240,7 +240,7 @@ def test_every_boundary_is_a_listener_here():
 
 @pytest.mark.parametrize("method", [m for m in REGISTRY if m.page != FAMILY_PAGE], ids=lambda method: method.algo)
 def test_every_method_trains_with_a_signal(method):
-    policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
+    policy_kwargs = {**method.policy_kwargs, "net_arch": [8]}
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
     model = make_model(method.algorithm.__name__, World(), policy=method.policy, policy_kwargs=policy_kwargs)

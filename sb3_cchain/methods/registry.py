@@ -238,7 +238,11 @@ REGISTRY = (
         *("spectral_norm", "ppo_spectral_norm", PPO, "Spectral normalisation", "slategray", PLASTICITY_PAGE),
         policy=SpectralNormPolicy,
     ),
-    Method(*("simba", "ppo_simba", PPO, "SimBa", "chocolate", PLASTICITY_PAGE), policy=SimBaPolicy),
+    Method(
+        *("simba", "ppo_simba", PPO, "SimBa", "chocolate", PLASTICITY_PAGE),
+        policy=SimBaPolicy,
+        policy_kwargs={"net_arch": {"pi": [128], "vf": [512, 512]}},
+    ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
     *_family(),

@@ -85,7 +85,7 @@ class UPGD(OptimizerWrapper):
             return
         greatest = self.own_state["greatest_utility"] = th.stack([utility.max() for utility, _ in traces]).max()
         for (parameter, lr), (utility, n_updates), old in zip(trained, traces, before, strict=True):
-            # With the moments, so that what resets those resets this. After the base, which makes its state where there is none
+            # With the moments, so that what resets those resets this; after the base, which makes a state where none is
             self.state[parameter].update(utility=utility, n_utility_updates=n_updates)
             scaled = th.where(greatest > 0, utility / ((1 - self.beta**n_updates) * greatest), 0.0)
             gate = 2 * th.sigmoid(-scaled)  # 1 - φ(x) = φ(-x)
