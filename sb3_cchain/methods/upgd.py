@@ -92,12 +92,12 @@ class UPGD(OptimizerWrapper):
             noise = th.randn_like(parameter) * self.sigma
             parameter.copy_((1 - lr * self.weight_decay) * old + gate * (parameter - old - lr * noise))
 
-    def _trace_utility(self, parameter: th.Tensor) -> tuple[th.Tensor, int]:
+    def _trace_utility(self, parameter: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """The utilities after this update's gradient, and the number of gradients in them."""
         assert parameter.grad is not None
         state = self.state.get(parameter, {})
         utility = self.beta * state.get("utility", 0.0) - (1 - self.beta) * parameter.grad * parameter
-        return utility, state.get("n_utility_updates", 0) + 1
+        return utility, state.get("n_utility_updates", parameter.new_zeros(())) + 1
 
     def metrics(self) -> dict[str, float]:
         """
