@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3 import DQN, PPO
 
 from sb3_cchain import ContinualEnv, TaskSync
-from sb3_cchain.methods import AdamRel, OptimizerMetrics, Oracle, PlasticityInjection, ReDo, ShrinkAndPerturb
+from sb3_cchain.methods import AdamRel, EWCConsolidation, OptimizerMetrics, Oracle, PlasticityInjection, ReDo, ShrinkAndPerturb
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
 from tests.envs import CountEnv
@@ -47,7 +47,7 @@ REFUSED = {
 def compose(one, other, algorithm="PPO"):
     """A model and callbacks with two methods: the optimiser of the first around that of the second."""
     methods = (one, other)
-    policy_kwargs = dict(net_arch=[8], **one.policy_kwargs, **other.policy_kwargs)
+    policy_kwargs = {"net_arch": [8], **one.policy_kwargs, **other.policy_kwargs}
     # An activation goes into any policy, and a policy that the optimiser's row recommends gives way
     policies = sorted(
         (method for method in methods if method.policy != "MlpPolicy"),
@@ -106,9 +106,13 @@ def test_refused_pairs_are_of_the_registry():
     assert all(set(pair) <= names and tuple(sorted(pair)) == pair for pair in REFUSED)
 
 
-# AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own
+# AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own,
+# EWCConsolidation an optimiser
 def callbacks():
-    return [TaskSync(), *(make_callback(cls) for cls in CALLBACKS if cls not in (AdamRel, PlasticityInjection))]
+    return [
+        TaskSync(),
+        *(make_callback(cls) for cls in CALLBACKS if cls not in (AdamRel, PlasticityInjection, EWCConsolidation)),
+    ]
 
 
 def find(cls, callbacks):
@@ -156,7 +160,7 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
     def callbacks():
         redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
         # The environment is not continual, so Oracle has nothing to do
-        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle, PlasticityInjection)]
+        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle, PlasticityInjection, EWCConsolidation)]
         return [redo, *others, OptimizerMetrics()] if everything else [redo]
 
     layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
@@ -188,7 +192,7 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
     # TRAC's scale may have fallen to 0, the moments are of the gradients all the same
     moments, moments_after_loading = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
     for parameter in range(len(model.policy.optimizer.param_groups[0]["params"])):
-        assert moments[parameter]["exp_avg"].any()
+        assert moments[parameter]["momentum_buffer" if "momentum_buffer" in moments[parameter] else "exp_avg"].any()
         assert all(th.equal(value, moments_after_loading[parameter][key]) for key, value in moments[parameter].items())
 
 

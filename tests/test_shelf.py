@@ -73,6 +73,13 @@ SHELF = {
     "regrama": Row(NEVER, **RECYCLING),
     "self_normalized_resets": Row(NEVER, **RECYCLING),
     "fire": Row(NEVER, **RESET),
+    "spectral_regularization": Row(dict(coef=0)),
+    "ewc": Row(dict(coef=0)),
+    "upgd": Row(),
+    "muon": Row(),
+    "kron": Row(),
+    "spectral_norm": Row(),
+    "simba": Row(),
 }
 # Arguments with which exactly the silent units are recycled, at the end of the first rollout or update
 SILENT = {
@@ -114,7 +121,7 @@ def policy_of(method, algorithm):
 
 def make(method, algorithm, off=False, env=None, **settings):
     """A model and callbacks: the method with another algorithm, and without effect on request."""
-    policy_kwargs = dict(net_arch=[8, 8], **method.policy_kwargs)
+    policy_kwargs = {"net_arch": [8, 8], **method.policy_kwargs}
     arguments = SHELF[method.name].off if off else {}
     if method.optimizer_class is not None:
         kwargs = {**optimizer_arguments(method), **arguments}

@@ -95,7 +95,8 @@ def related() -> Case:
         adam = settings["policy_kwargs"].pop("optimizer_kwargs")
         policy_kwargs = {"optimizer_kwargs": adam, **settings["policy_kwargs"], **method.policy_kwargs}
         if method.optimizer_class is not None:
-            optimizer_kwargs = {"base_kwargs": adam, **method.optimizer_kwargs}
+            base = {"base_kwargs": adam} if method.optimizer_class.has_arguments_of_base else {}
+            optimizer_kwargs = {**base, **method.optimizer_kwargs}
             policy_kwargs |= {"optimizer_class": method.optimizer_class, "optimizer_kwargs": optimizer_kwargs}
         model = method.algorithm(**{**settings, "policy": method.policy, "policy_kwargs": policy_kwargs})
         # Each with the callbacks that it learns with

@@ -2,10 +2,14 @@
 
 from sb3_cchain.methods.adam_rel import AdamRel
 from sb3_cchain.methods.continual_backprop import ContinualBackprop
+from sb3_cchain.methods.ewc import EWC
+from sb3_cchain.methods.ewc_consolidation import EWCConsolidation
 from sb3_cchain.methods.exploration import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
 from sb3_cchain.methods.fire import FIRE
+from sb3_cchain.methods.kron import Kron
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.layer_reset import LayerReset
+from sb3_cchain.methods.muon import Muon
 from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
@@ -17,19 +21,26 @@ from sb3_cchain.methods.redo import ReDo
 from sb3_cchain.methods.regrama import ReGraMa
 from sb3_cchain.methods.self_normalized_resets import SelfNormalizedResets
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.spectral_regularization import SpectralRegularization
 from sb3_cchain.methods.trac import TRAC
+from sb3_cchain.methods.upgd import UPGD
 from sb3_cchain.methods.weight_clipping import WeightClipping
 
 __all__ = [
+    "EWC",
     "FIRE",
     "TRAC",
+    "UPGD",
     "AdamRel",
     "ContinualBackprop",
+    "EWCConsolidation",
     "EntropyBonusRestart",
     "ExplorationRateRestart",
+    "Kron",
     "L2Init",
     "LayerReset",
     "LogStdRestart",
+    "Muon",
     "NormalizeAndProject",
     "OptimizerMetrics",
     "OptimizerWrapper",
@@ -41,5 +52,6 @@ __all__ = [
     "ReGraMa",
     "SelfNormalizedResets",
     "ShrinkAndPerturb",
+    "SpectralRegularization",
     "WeightClipping",
 ]
