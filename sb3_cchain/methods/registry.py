@@ -209,7 +209,7 @@ REGISTRY = (
         policy_kwargs={"activation_fn": FourierFeatures},
     ),
     Method(
-        *("continual_backprop", "ppo_continual_backprop", PPO, "Continual backprop", "darkgreen", PLASTICITY_PAGE),
+        *("continual_backprop", "ppo_continual_backprop", PPO, "Continual backprop", "olivedrab", PLASTICITY_PAGE),
         callbacks=(ContinualBackprop,),
         grid={"replacement_rate": [1e-5, 1e-4, 1e-3], "maturity_threshold": [1000, 10_000]},  # a decade around the paper's
     ),
@@ -220,7 +220,7 @@ REGISTRY = (
         grid={"tau": [0.0, 0.01, 0.1], "interval": [1, 10, 100]},
     ),
     Method(
-        *("self_normalized_resets", "ppo_self_normalized_resets", PPO, "Self-normalized resets", "sienna", PLASTICITY_PAGE),
+        *("self_normalized_resets", "ppo_self_normalized_resets", PPO, "Self-normalized resets", "peru", PLASTICITY_PAGE),
         callbacks=(SelfNormalizedResets,),
         grid={"eta": [0.01, 0.02, 0.04, 0.08]},
     ),
