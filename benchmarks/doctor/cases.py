@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation, TransformReward
 from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from sb3_contrib.common.wrappers import ActionMasker
@@ -62,18 +63,20 @@ def _observations_times(factor: float, env: gym.Env) -> gym.Env:
 
 
 def _pay_for(action: int, env: gym.Env) -> gym.Env:
-    """Whatever happens, the reward is 1 for one action and 0 for the others."""
+    """Whatever happens, the reward is 1 for one action and -1 for the others."""
 
     class Paid(gym.Wrapper):
         def step(self, taken: Any) -> Any:
             observation, _, *rest = self.env.step(taken)
-            return observation, float(taken == action), *rest
+            return observation, 1.0 if taken == action else -1.0, *rest
 
     return Paid(env)
 
 
 def _all_actions_allowed(env: gym.Env) -> gym.Env:
-    return ActionMasker(env, lambda inner: np.ones(int(inner.action_space.n), dtype=bool))
+    assert isinstance(env.action_space, spaces.Discrete)
+    mask = np.ones(env.action_space.n, dtype=bool)
+    return ActionMasker(env, lambda _: mask)
 
 
 def _shift_biases(shift: float, model: BaseAlgorithm) -> None:
@@ -83,7 +86,7 @@ def _shift_biases(shift: float, model: BaseAlgorithm) -> None:
             if isinstance(module, nn.Sequential):
                 for layer, following in zip(module, list(module)[1:], strict=False):
                     if isinstance(layer, nn.Linear) and isinstance(following, nn.ReLU):
-                        layer.bias += shift
+                        layer.bias.add_(shift)
 
 
 def _noise(sigma: float) -> dict[str, Any]:
@@ -92,6 +95,11 @@ def _noise(sigma: float) -> dict[str, Any]:
 
 X10000 = partial(_rewards_times, 1e4)
 RELU = {"policy_kwargs": {"activation_fn": nn.ReLU}}
+
+# A wrong sign
+GROWTH: dict[str, Any] = {
+    "policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": -5.0}},
+}
 
 # RL Zoo's settings, without its schedules
 PPO_CARTPOLE: dict[str, Any] = {
@@ -122,7 +130,7 @@ SAC_MCC: dict[str, Any] = {
     **{"learning_starts": 0, "use_sde": True},
     "policy_kwargs": {"log_std_init": -3.67, "net_arch": [64, 64], "use_expln": True},
 }
-NORMALIZED = {"n_envs": 8, "normalize": True}
+NORMALIZED: Any = {"n_envs": 8, "normalize": True}
 
 CHOSEN_ON: dict[str, Case] = {
     # Healthy
@@ -137,16 +145,35 @@ CHOSEN_ON: dict[str, Case] = {
     "trpo_cartpole": Case(TRPO, "CartPole-v1", (4096, 16_000), {"n_steps": 512, "batch_size": 512}, n_envs=2),
     # Sick
     "ppo_cartpole_rate": Case(
-        *(PPO, "CartPole-v1", (20_000,), {**PPO_CARTPOLE, "learning_rate": 0.1}, ("exploding_weights",)),
+        *(
+            PPO,
+            "CartPole-v1",
+            (20_000,),
+            {**PPO_CARTPOLE, "learning_rate": 0.1},
+            ("collapsed_policy", "no_exploration", "vanishing_gradients"),
+        ),
         cause="learning rate 0.1",
         n_envs=8,
     ),
     "a2c_cartpole_rate": Case(
-        *(A2C, "CartPole-v1", (20_000,), {"learning_rate": 0.1}, ("exploding_weights",)), cause="learning rate 0.1", n_envs=8
+        *(
+            A2C,
+            "CartPole-v1",
+            (20_000,),
+            {"learning_rate": 0.1},
+            ("collapsed_policy", "no_exploration", "vanishing_gradients"),
+        ),
+        cause="learning rate 0.1",
+        n_envs=8,
     ),
     "dqn_cartpole_rate": Case(
         *(DQN, "CartPole-v1", (8000,), {**DQN_CARTPOLE, **BIG, "learning_rate": 0.3}, ("exploding_weights",)),
         cause="learning rate 0.3",
+    ),
+    "ppo_cartpole_growth": Case(
+        *(PPO, "CartPole-v1", (20_000,), {**PPO_CARTPOLE, **GROWTH}, ("exploding_weights",)),
+        cause="negative weight decay",
+        n_envs=8,
     ),
     "ppo_cartpole_updates": Case(
         *(PPO, "CartPole-v1", (10_000,), {**PPO_CARTPOLE, "clip_range": 100.0, "n_epochs": 100, "learning_rate": 5e-3}),
@@ -156,7 +183,7 @@ CHOSEN_ON: dict[str, Case] = {
     ),
     "ppo_cartpole_paid": Case(
         *(PPO, "CartPole-v1", (30_000,), {**PPO_CARTPOLE}, ("collapsed_policy", "no_exploration")),
-        cause="a reward for one action alone",
+        cause="a reward for one action, a penalty for the others",
         n_envs=8,
         wrap=partial(_pay_for, 0),
     ),
@@ -267,16 +294,34 @@ HELD_OUT: dict[str, Case] = {
     "ars_cartpole": Case(ARS, "CartPole-v1", (10_000,), {"n_delta": 2}, policy="LinearPolicy", seed=1),
     # Sick
     "ppo_acrobot_rate": Case(
-        *(PPO, "Acrobot-v1", (20_000,), {**PPO_ACROBOT, "learning_rate": 0.1}, ("exploding_weights",)),
+        *(
+            PPO,
+            "Acrobot-v1",
+            (20_000,),
+            {**PPO_ACROBOT, "learning_rate": 0.1},
+            ("collapsed_policy", "no_exploration", "vanishing_gradients"),
+        ),
         cause="learning rate 0.1",
         n_envs=8,
     ),
     "a2c_acrobot_rate": Case(
-        *(A2C, "Acrobot-v1", (20_000,), {"learning_rate": 0.1}, ("exploding_weights",)), cause="learning rate 0.1", n_envs=8
+        *(A2C, "Acrobot-v1", (20_000,), {"learning_rate": 0.1}, ("collapsed_policy", "no_exploration", "vanishing_gradients")),
+        cause="learning rate 0.1",
+        n_envs=8,
     ),
     "dqn_acrobot_rate": Case(
         *(DQN, "Acrobot-v1", (8000,), {**DQN_ACROBOT, **BIG, "learning_rate": 0.3}, ("exploding_weights",)),
         cause="learning rate 0.3",
+    ),
+    "a2c_acrobot_growth": Case(
+        *(A2C, "Acrobot-v1", (40_000,), GROWTH, ("exploding_weights",)), cause="negative weight decay", n_envs=8
+    ),
+    "sac_pendulum_growth": Case(
+        *(SAC, "Pendulum-v1", (3000,)),
+        {"policy_kwargs": {"net_arch": [64, 64], **GROWTH["policy_kwargs"]}},
+        expected=("exploding_weights",),
+        cause="negative weight decay",
+        seed=1,
     ),
     "ppo_acrobot_updates": Case(
         *(PPO, "Acrobot-v1", (10_000,), {**PPO_ACROBOT, "clip_range": 100.0, "n_epochs": 40, "learning_rate": 5e-3}),
@@ -286,7 +331,7 @@ HELD_OUT: dict[str, Case] = {
     ),
     "ppo_acrobot_paid": Case(
         *(PPO, "Acrobot-v1", (40_000,), {**PPO_ACROBOT, "learning_rate": 1e-3}, ("collapsed_policy", "no_exploration")),
-        cause="a reward for one action alone",
+        cause="a reward for one action, a penalty for the others",
         n_envs=8,
         wrap=partial(_pay_for, 1),
     ),

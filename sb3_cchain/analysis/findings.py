@@ -110,8 +110,8 @@ CHECKS = (
     ),
     Check(
         *("dormant_units", "Hidden units are dormant", "dormant_units", "above", 0.7, "likely"),
-        "Share of the hidden units with a mean activation of at most 0.025 times that of their layer, in the worst group. They "
-        "do nothing, and with ReLU they get no gradient.",
+        "Share of the hidden units with a mean activation of at most 0.025 times that of their layer, in the worst group. "
+        "They do nothing, and with ReLU they get no gradient.",
         f"Score of 0.025: Sokar et al. (ICML 2023), arXiv 2302.12902. Share: {OWN}",
         (r.REDO, r.CRELU, r.LAYER_NORM, r.LAYER_NORM_DQN, r.SHRINK, r.SMALLER_RATE, r.CCHAIN),
     ),
@@ -131,22 +131,22 @@ CHECKS = (
     ),
     Check(
         *("too_large_updates", "The updates change the policy too much", "policy_change", "above", 0.2, "likely"),
-        "KL divergence of the policy before one iteration from that after it, on the rollout's observations, in nats. The data "
-        "was collected by the policy before, and says little about one so different.",
+        "KL divergence of the policy before one iteration from that after it, on the rollout's observations, in nats. The "
+        "data was collected by the policy before, and says little about one so different.",
         "SB3's `target_kl` is usually 0.01 to 0.05",
         (r.TARGET_KL, r.SMALLER_RATE, r.CCHAIN),
     ),
     Check(
         *("dead_values", "The values are the same everywhere", "value_spread", "below", 0.01, "likely"),
-        "Standard deviation of the values over the observations, divided by that of their targets. Such a value function tells "
-        "no state from another, so the policy learns from noise.",
+        "Standard deviation of the values over the observations, divided by that of their targets. Such a value function "
+        "tells no state from another, so the policy learns from noise.",
         OWN,
         (r.VALUE_COEF, r.NORMALIZE, r.LAYER_NORM, r.LAYER_NORM_DQN, r.REDO, r.CCHAIN),
     ),
     Check(
         *("large_rewards", "The rewards are too large", "value_scale", "above", 5000, "likely"),
-        "Root mean square of what the values are trained on. A network begins with values about 0, and a step of Adam moves it "
-        "by little. Meanwhile the value loss swamps everything else that shares its gradient, its layers or its clipping.",
+        "Root mean square of what the values are trained on. A network begins with values about 0, and a step of Adam moves "
+        "it by little. Meanwhile the value loss swamps everything else that shares its gradient, its layers or its clipping.",
         OWN,
         (r.NORMALIZE,),
     ),

@@ -22,13 +22,16 @@ _PAGE = Template("""<!DOCTYPE html>
 :root { color-scheme: light dark; --line: #8886; --ill: #c62828; --maybe: #b26a00; --well: #2e7d32; }
 @media (prefers-color-scheme: dark) { :root { --ill: #ff8a80; --maybe: #ffcc80; --well: #a5d6a7; } }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 1.5rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.25rem; margin-top: 2.5rem; overflow-wrap: anywhere; } h3 { margin: 0; font-size: 1.05rem; }
+h1 { font-size: 1.5rem; }
+h2 { font-size: 1.25rem; margin-top: 2.5rem; overflow-wrap: anywhere; }
+h3 { margin: 0; font-size: 1.05rem; }
 .verdict, .finding { border-left: 0.4rem solid var(--well); padding: 0.1rem 0 0.1rem 0.9rem; margin: 1rem 0; }
 .likely { border-color: var(--ill); } .possible { border-color: var(--maybe); }
 .verdict { font-size: 1.1rem; font-weight: 600; }
 .finding p { margin: 0.4rem 0; } .source { font-size: 0.85rem; opacity: 0.8; }
 .ill { color: var(--ill); font-weight: 600; } .maybe { color: var(--maybe); font-weight: 600; } .well { color: var(--well); }
-pre { overflow-x: auto; padding: 0.6rem; border: 1px solid var(--line); border-radius: 4px; font-size: 0.85rem; margin: 0.3rem 0; }
+pre { overflow-x: auto; padding: 0.6rem; margin: 0.3rem 0; border: 1px solid var(--line); border-radius: 4px; }
+pre { font-size: 0.85rem; }
 .table { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.6rem 0.3rem 0; border-bottom: 1px solid var(--line); }

@@ -68,7 +68,7 @@ def acting_symptoms(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -
 
 
 def _bounds(model: BaseAlgorithm) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """Of the actions as the networks give them: the least, the greatest, and half their range (1 where there are no bounds)."""
+    """Of the actions as the networks give them: least and greatest, and half the range (1 where there are no bounds)."""
     space = model.action_space
     assert isinstance(space, spaces.Box)
     low, high = (th.as_tensor(bound.flatten(), device=model.device, dtype=th.float32) for bound in (space.low, space.high))
@@ -107,7 +107,7 @@ def _exploration(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -> t
     std = action_std(model, batch)
     if std is not None:
         return std.mean(dim=0) / _bounds(model)[2]
-    noise: Any = model.action_noise  # type: ignore[union-attr]
+    noise: Any = getattr(model, "action_noise", None)
     if hasattr(noise, "noises"):  # one of each environment
         noise = noise.noises[0]
     sigma = 0.0 if noise is None else getattr(noise, "_sigma", None)
@@ -133,7 +133,7 @@ def action_std(model: BaseAlgorithm, batch: Batch) -> th.Tensor | None:
             else:
                 distribution = policy.get_distribution(observations)
             return distribution.distribution.stddev
-        actor = getattr(policy, "actor", None)
+        actor: Any = getattr(policy, "actor", None)
         if not hasattr(actor, "get_action_dist_params"):
             return None
         mean, log_std, latent = actor.get_action_dist_params(observations)

@@ -12,11 +12,9 @@ import yaml
 from rich.console import Console
 from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict, create_test_env, get_callback_list, get_saved_hyperparams
-from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
@@ -132,8 +130,8 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Roll out saved models, train them a little, and report what is wrong with them, and their churn, their\n"
         "neural tangent kernel and the health of their networks. The files are not changed.",
-        epilog="Exit code: 0 when there are no findings as certain as --fail-on asks for, 3 when there are, 2 when a file is no\n"
-        "model that can be read or an argument is wrong.",
+        epilog="Exit code: 0 when there are no findings as certain as --fail-on asks for, 3 when there are, 2 when a file\n"
+        "is no model that can be read or an argument is wrong.",
     )
     parser.add_argument("models", nargs="+", type=Path, metavar="MODEL.zip", help="One saved model, or two to compare")
     parser.add_argument("--env", required=True, help="Environment id")
