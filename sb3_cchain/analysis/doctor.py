@@ -17,7 +17,7 @@ from sb3_cchain.analysis.symptoms import (
     policy_change,
     symptoms_of,
     value_symptoms,
-    weight_matrix_groups,
+    weight_matrices,
     weight_symptoms,
 )
 from sb3_cchain.analysis.training_interval import TrainingInterval
@@ -88,9 +88,9 @@ class Doctor(TrainingInterval):
             batch = sample_batch(self.model, self.batch_size)
             self._before = (batch, *self._outputs(batch))
             self.symptoms = {**symptoms_of(self.model, batch), **value_symptoms(self.model, self.batch_size)}
-        groups = weight_matrix_groups(self.model)
+        weights = weight_matrices(self.model)
         for optimizer in model_optimizers(self.model).values():
-            self._hooks.before_step(optimizer, lambda optimizer: note_gradients(self.symptoms, groups, optimizer))
+            self._hooks.before_step(optimizer, lambda optimizer: note_gradients(self.symptoms, weights, optimizer))
 
     def _outputs(self, batch: Batch) -> tuple[ModelOutputs, th.Tensor | None]:
         is_continuous = isinstance(self.model, OnPolicyAlgorithm) and hasattr(self.model.policy, "log_std")

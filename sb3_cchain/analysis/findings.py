@@ -95,7 +95,7 @@ CHECKS = (
         (r.SMALLER_RATE, r.NORMALIZE, r.L2_INIT),
     ),
     Check(
-        *("saturated_units", "Hidden units are saturated", "saturated_units", "above", 0.5, "likely"),
+        *("saturated_units", "Hidden units are saturated", "saturated_units", "above", 0.75, "likely"),
         "Share of the outputs of tanh and sigmoid units within 1 % of a bound, in the worst group of layers. They pass hardly "
         "any gradient. Often the observations are large, or the learning rate is.",
         OWN,
@@ -109,23 +109,23 @@ CHECKS = (
         (r.CCHAIN, r.LAYER_NORM, r.LAYER_NORM_DQN, r.LAYER_RESET, r.SHRINK, r.SMALLER_RATE),
     ),
     Check(
-        *("dormant_units", "Hidden units are dormant", "dormant_units", "above", 0.7, "likely"),
+        *("dormant_units", "Hidden units are dormant", "dormant_units", "above", 0.9, "likely"),
         "Share of the hidden units with a mean activation of at most 0.025 times that of their layer, in the worst group. "
         "They do nothing, and with ReLU they get no gradient.",
         f"Score of 0.025: Sokar et al. (ICML 2023), arXiv 2302.12902. Share: {OWN}",
         (r.REDO, r.CRELU, r.LAYER_NORM, r.LAYER_NORM_DQN, r.SHRINK, r.SMALLER_RATE, r.CCHAIN),
     ),
     Check(
-        *("exploding_weights", "The weights have grown huge", "weight_gain", "above", 10, "likely"),
+        *("exploding_weights", "The weights have grown huge", "weight_gain", "above", 20, "likely"),
         "What the worst weight matrix makes of the size of random inputs; 1.4 or less after initialisation. Infinite where a "
         "parameter is no number any more. Then outputs are extreme, and updates of the usual size hardly change them.",
         OWN,
         (r.SMALLER_RATE, r.CLIPPING, r.L2_INIT, r.NORMALIZE),
     ),
     Check(
-        *("vanishing_gradients", "The gradients have vanished", "gradient_size", "below", 0.01, "likely"),
-        "Root mean square of the gradient of the worst group of layers, divided by the ε of its optimiser, at the greatest "
-        "update. Far below 1, Adam and RMSprop move these layers much less than the learning rate says.",
+        *("vanishing_gradients", "The gradients have vanished", "gradient_size", "below", 1e-3, "likely"),
+        "Root mean square of the gradient of the worst weight matrix, divided by the ε of its optimiser, at the greatest "
+        "update. Far below 1, Adam and RMSprop move these weights much less than the learning rate says.",
         f"The step of Adam for gradients far below ε, Kingma & Ba (2015), arXiv 1412.6980; {OWN}",
         (r.RELU, r.LAYER_NORM, r.LAYER_NORM_DQN, r.REDO, r.LAYER_RESET, r.NORMALIZE),
     ),
@@ -137,7 +137,7 @@ CHECKS = (
         (r.TARGET_KL, r.SMALLER_RATE, r.CCHAIN),
     ),
     Check(
-        *("dead_values", "The values are the same everywhere", "value_spread", "below", 0.01, "likely"),
+        *("dead_values", "The values are the same everywhere", "value_spread", "below", 5e-4, "likely"),
         "Standard deviation of the values over the observations, divided by that of their targets. Such a value function "
         "tells no state from another, so the policy learns from noise.",
         OWN,
@@ -261,3 +261,16 @@ def as_json(value: Any) -> Any:
     :return: It, or None where JSON has no such number
     """
     return value if math.isfinite(value) else None
+
+
+def findings_markdown() -> str:
+    """
+    :return: A table of all findings for the documentation
+    """
+    rows = []
+    for check in CHECKS:
+        remedies = dict.fromkeys(remedy.title for remedy in check.remedies)
+        cells = [f"`{check.name}`", check.certainty, f"{check.title}. {check.meaning}"]
+        rows.append([*cells, check.healthy_range(), check.source, "; ".join(remedies)])
+    lines = [["finding", "", "what it means", "healthy", "where the threshold comes from", "what to try"], ["---"] * 6, *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -208,7 +208,8 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
     r"""
     What the values are like. They are compared with what they are trained on: of an on-policy algorithm the returns of the
     rollout; off-policy :math:`r + \gamma V(s')` on a batch of the replay buffer, with the networks that act and without
-    SAC's entropy.
+    SAC's entropy. The value of a state is the greatest of its action values (DQN, QRDQN), or the mean of the critics' (of the
+    action in the buffer, or of the next one).
 
     - ``value_spread``: standard deviation of the values, divided by that of their targets; 0 for values that are all the
       same. Not where the targets are all the same.
@@ -250,7 +251,7 @@ def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[np.nda
             values = values.mean(dim=kind.quantiles)
         if kind.actions is not None:
             return values.mean(dim=1)
-        return values.max(dim=1).values if actions is None else values.gather(1, actions.long()).squeeze(1)
+        return values.max(dim=1).values
 
     with th.no_grad(), evaluation_mode(policy):
         values = values_of(sample.observations, sample.actions)
@@ -279,32 +280,30 @@ def policy_change(old: ModelOutputs, new: ModelOutputs, old_std: th.Tensor | Non
     return th.distributions.kl_divergence(before, after).sum(dim=1).mean().item()
 
 
-def weight_matrix_groups(model: BaseAlgorithm) -> dict[str, list[nn.Parameter]]:
+def weight_matrices(model: BaseAlgorithm) -> dict[str, nn.Parameter]:
     """
     :param model: A model
-    :return: The trained parameters of each group of layers that has a weight matrix
+    :return: Its trained weight matrices, and the kernels of convolutions, by name
     """
-    groups = {group: list(parameters.values()) for group, parameters in trained_groups(model).items()}
-    return {group: parameters for group, parameters in groups.items() if any(p.dim() > 1 for p in parameters)}
+    parameters = {name: parameter for group in trained_groups(model).values() for name, parameter in group.items()}
+    return {name: parameter for name, parameter in parameters.items() if parameter.dim() > 1}
 
 
-def note_gradients(sizes: Symptoms, groups: dict[str, list[nn.Parameter]], optimizer: th.optim.Optimizer) -> None:
+def note_gradients(sizes: Symptoms, weights: dict[str, nn.Parameter], optimizer: th.optim.Optimizer) -> None:
     """
-    Keep the greatest ``gradient_size`` of each group: the root mean square of its gradient's entries, as the optimiser gets
-    it, divided by the ε of the optimiser (1e-8 where it has none). Adam and RMSprop divide gradients by their size, but add
-    ε to it: gradients far below ε move nothing.
+    Keep the greatest ``gradient_size`` of each weight matrix: the root mean square of its gradient's entries, as the optimiser
+    gets it, divided by the ε of the optimiser (1e-8 where it has none). Adam and RMSprop divide gradients by their size, but
+    add ε to it: gradients far below ε move nothing.
 
     :param sizes: What was found in earlier updates
-    :param groups: :func:`weight_matrix_groups`
+    :param weights: :func:`weight_matrices`
     :param optimizer: An optimiser that is about to make a step
     """
     epsilons = {p: float(group.get("eps", 1e-8)) for group in optimizer.param_groups for p in group["params"]}
-    for group, parameters in groups.items():
-        gradients = [parameter.grad for parameter in parameters if parameter in epsilons and parameter.grad is not None]
-        if gradients:
-            norm = th.stack([th.linalg.vector_norm(gradient) for gradient in gradients]).norm().item()
-            size = norm / math.sqrt(sum(gradient.numel() for gradient in gradients)) / epsilons[parameters[0]]
-            sizes[f"gradient_size/{group}"] = max(size, sizes.get(f"gradient_size/{group}", 0.0))
+    for name, weight in weights.items():
+        if weight in epsilons and weight.grad is not None:
+            size = weight.grad.square().mean().sqrt().item() / epsilons[weight]
+            sizes[f"gradient_size/{name}"] = max(size, sizes.get(f"gradient_size/{name}", 0.0))
 
 
 def symptoms_of(model: BaseAlgorithm, batch: Batch) -> Symptoms:
