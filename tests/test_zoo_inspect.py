@@ -1,8 +1,9 @@
-"""``sb3-cchain inspect``: one line where a file cannot be inspected, before the work starts."""
+"""``sb3-cchain inspect``: one line where a file cannot be inspected, before the work starts; findings, and exit codes."""
 
 import json
 import os
 import re
+import zipfile
 
 import pytest
 import torch as th
@@ -12,6 +13,8 @@ from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.inspect
 from sb3_cchain import CChainPPO
+from sb3_cchain.analysis.findings import diagnose
+from sb3_cchain.analysis.inspection import Inspection, inspect_model
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
 
@@ -47,17 +50,21 @@ def torn(path):
     path.write_bytes(path.read_bytes()[:-200])
 
 
-def not_finite(path):
-    model = make()
-    with th.no_grad():
-        model.policy.value_net.weight[0, 0] = th.nan
-    model.save(path)
-
-
 def of_other_shapes(path):
     model = make()
     model.policy_kwargs = dict(net_arch=[5])
     model.save(path)
+
+
+def of_lost_class(path):
+    """Of an algorithm whose code is gone."""
+    model = make()
+    model.save(path)
+    data = json.loads(zipfile.ZipFile(path).read("data"))
+    data["policy_class"][":serialized:"] = "bm9uZQ=="
+    save_to_zip_file(path, params=model.get_parameters())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("data", json.dumps(data))
 
 
 @pytest.mark.parametrize(
@@ -66,7 +73,7 @@ def of_other_shapes(path):
         (without_data, "without the model's settings (no entry `data`): save it by the model's save()"),
         (torn, "is torn or not a saved model"),
         (lambda path: path.write_text("no zip"), "is torn or not a saved model"),
-        (not_finite, "parameter value_net.weight has entries that are not finite"),
+        (of_lost_class, "cannot be read"),
         (of_other_shapes, "cannot be loaded as PPO: RuntimeError('Error(s) in loading state_dict"),
     ],
 )
@@ -129,6 +136,80 @@ def test_output_that_cannot_be_written_to(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sb3_cchain.checkpoint.files.TemporaryFile", full)
     line = error_of(capsys, tmp_path / "model.zip", "--output", tmp_path / "full")
     assert line == f"--output {tmp_path / 'full'}: No space left on device. {mend}"
+
+
+# A likely finding, and a possible one
+SYMPTOMS = {"healthy": {}, "likely": {"weight_gain/layer": 100.0}, "possible": {"discount": 0.0}}
+
+
+@pytest.mark.parametrize(
+    "kind, options, code",
+    [
+        ("healthy", ["--fail-on", "possible"], 0),
+        ("likely", [], 3),
+        ("likely", ["--fail-on", "possible"], 3),
+        ("likely", ["--fail-on", "never"], 0),
+        ("likely", ["--ignore", "exploding_weights"], 0),
+        ("likely", ["--ignore", "short_horizon"], 3),
+        ("possible", [], 0),
+        ("possible", ["--fail-on", "possible"], 3),
+        ("possible", ["--fail-on", "possible", "--ignore", "no_exploration", "short_horizon"], 0),
+    ],
+)
+def test_exit_codes_and_json(kind, options, code, tmp_path, monkeypatch, capsys):
+    make().save(tmp_path / "model.zip")
+    symptoms = SYMPTOMS[kind]
+
+    def found(model, name, *_):
+        return Inspection(name, {}, algorithm="PPO", symptoms=symptoms, findings=diagnose(symptoms, model))
+
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", found)
+    arguments = ["inspect", tmp_path / "model.zip", "--env", "CartPole-v1", "--output", tmp_path, "--json", *options]
+    if code:
+        with pytest.raises(SystemExit) as exit_info:
+            command(*arguments)
+        assert exit_info.value.code == code
+    else:
+        command(*arguments)
+    output = capsys.readouterr()
+    printed = json.loads(output.out)
+    assert printed["version"] == 1 and printed["exit_code"] == code
+    (model,) = printed["models"]
+    assert set(model) == {"file", "env", *OF_A_MODEL} and model["file"] == str(tmp_path / "model.zip")
+    assert model["measures"] == symptoms and "collapsed_policy" in model["not_measured"]
+    if kind == "healthy" or "exploding_weights" in options or "no_exploration" in options:
+        assert model["findings"] == [] and "no findings" in output.err
+    else:
+        (finding,) = model["findings"]
+        assert set(finding) == OF_A_FINDING and finding["certainty"] == kind
+        assert set(finding["remedies"][0]) == {"title", "line", "method"}
+        assert finding["title"].split()[0] in output.err
+
+
+OF_A_MODEL = {"name", "algorithm", "num_timesteps", "findings", "measures", "not_measured"}
+OF_A_FINDING = {"name", "title", "certainty", "measure", "value", "part", "sick", "threshold", "meaning", "source", "remedies"}
+
+
+def test_a_model_that_is_not_finite_is_found_and_not_refused(tmp_path, monkeypatch, capsys):
+    model = make()
+    with th.no_grad():
+        model.policy.value_net.weight[0, 0] = th.nan
+    model.save(tmp_path / "model.zip")
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", inspect_model)
+    page = tmp_path / "pages" / "page.html"
+    arguments = ["--env", "CartPole-v1", "--output", tmp_path, "--html", page]
+    with pytest.raises(SystemExit) as exit_info:
+        command("inspect", tmp_path / "model.zip", *arguments)
+    assert exit_info.value.code == 3
+    assert "weight gain inf in value_net.weight" in page.read_text() and "Findings: 1 likely" in page.read_text()
+    assert "The weights have grown huge" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_page_that_cannot_be_written(tmp_path, capsys):
+    make().save(tmp_path / "model.zip")
+    (tmp_path / "file").touch()
+    for page, message in ((tmp_path / "file" / "page.html", "can be written to"), (tmp_path, "it is a folder")):
+        assert message in error_of(capsys, tmp_path / "model.zip", "--output", tmp_path, "--html", page)
 
 
 def test_arguments_that_rl_zoo_saved_are_used(tmp_path, monkeypatch):

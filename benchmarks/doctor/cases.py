@@ -96,10 +96,8 @@ def _noise(sigma: float) -> dict[str, Any]:
 X10000 = partial(_rewards_times, 1e4)
 RELU = {"policy_kwargs": {"activation_fn": nn.ReLU}}
 
-# A wrong sign
-GROWTH: dict[str, Any] = {
-    "policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": -5.0}},
-}
+# The gradient is clipped, so that each step has the same length, which is far too great
+GROWTH: dict[str, Any] = {"learning_rate": 100.0, "policy_kwargs": {"optimizer_class": th.optim.SGD}}
 
 # RL Zoo's settings, without its schedules
 PPO_CARTPOLE: dict[str, Any] = {
@@ -173,7 +171,7 @@ CHOSEN_ON: dict[str, Case] = {
     ),
     "ppo_cartpole_growth": Case(
         *(PPO, "CartPole-v1", (8000,), {**PPO_CARTPOLE, **GROWTH}, ("exploding_weights",)),
-        cause="negative weight decay",
+        cause="SGD at learning rate 100",
         n_envs=8,
     ),
     "ppo_cartpole_updates": Case(
@@ -241,7 +239,7 @@ CHOSEN_ON: dict[str, Case] = {
     ),
     "td3_pendulum_rate": Case(
         *(TD3, "Pendulum-v1", (1500,), {**TD3_PENDULUM, **_noise(0.1), "learning_rate": 0.1}),
-        expected=("saturated_actions", "exploding_weights"),
+        expected=("saturated_actions",),
         cause="learning rate 0.1",
     ),
     "sac_pendulum_reward": Case(
@@ -315,14 +313,11 @@ HELD_OUT: dict[str, Case] = {
         cause="learning rate 0.3",
     ),
     "a2c_acrobot_growth": Case(
-        *(A2C, "Acrobot-v1", (24_000,), GROWTH, ("exploding_weights",)), cause="negative weight decay", n_envs=8
+        *(A2C, "Acrobot-v1", (24_000,), GROWTH, ("exploding_weights",)), cause="SGD at learning rate 100", n_envs=8
     ),
-    "sac_pendulum_growth": Case(
-        *(SAC, "Pendulum-v1", (1500,)),
-        {"policy_kwargs": {"net_arch": [64, 64], **GROWTH["policy_kwargs"]}},
-        expected=("exploding_weights",),
-        cause="negative weight decay",
-        seed=1,
+    "dqn_mountain_car_growth": Case(
+        *(DQN, "MountainCar-v0", (6000,), {**DQN_MOUNTAIN_CAR, **GROWTH}, ("exploding_weights",)),
+        cause="SGD at learning rate 100",
     ),
     "ppo_acrobot_updates": Case(
         *(PPO, "Acrobot-v1", (6000,), {**PPO_ACROBOT, "clip_range": 100.0, "n_epochs": 40, "learning_rate": 5e-3}),
@@ -402,13 +397,13 @@ HELD_OUT: dict[str, Case] = {
     ),
     "ddpg_pendulum_rate": Case(
         *(DDPG, "Pendulum-v1", (1500,), {**TD3_PENDULUM, **_noise(0.1), "learning_rate": 0.1}),
-        expected=("saturated_actions", "exploding_weights"),
+        expected=("saturated_actions",),
         cause="learning rate 0.1",
         seed=1,
     ),
     "td3_mountain_car_rate": Case(
         *(TD3, "MountainCarContinuous-v0", (1500,), {**TD3_PENDULUM, **_noise(0.5), "learning_rate": 0.1}),
-        expected=("saturated_actions", "exploding_weights"),
+        expected=("saturated_actions",),
         cause="learning rate 0.1",
     ),
     "tqc_pendulum_fixed_targets": Case(

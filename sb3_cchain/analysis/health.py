@@ -186,7 +186,9 @@ def hidden_activations(policy: Any, observations: PyTorchObs) -> dict[str, list[
 def _act(policy: Any, observations: PyTorchObs) -> Any:
     """Run the policy; the forward pass of an actor-critic policy includes its values."""
     if not hasattr(policy, "lstm_actor"):
-        return policy(observations, deterministic=True)
+        is_ars = hasattr(policy, "action_net") and not hasattr(policy, "predict_values")
+        # ARS never acts at random, and has no such argument
+        return policy(observations) if is_ars else policy(observations, deterministic=True)
     memory = empty_memory(policy, observations)
     episode_starts = th.ones(n_observations(observations), device=policy.device)
     return policy(observations, SimpleNamespace(pi=memory, vf=memory), episode_starts, deterministic=True)

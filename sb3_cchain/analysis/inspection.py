@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
-from rich.markup import escape
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -228,19 +227,17 @@ def report(inspections: Sequence[Inspection]) -> list[Table]:
     return [table for table in tables if table.row_count]
 
 
-def findings_table(inspection: Inspection) -> Table:
+def findings_text(inspection: Inspection) -> str:
     """
     :param inspection: Of a model
-    :return: Its findings, with what to try
+    :return: Its findings, with the code of what to try
     """
-    table = Table(title=f"Findings: {inspection.name}", title_justify="left", show_lines=True, min_width=60)
-    for column in ("finding", "measured", "try"):
-        table.add_column(column)
+    lines = [f"{inspection.name}: {len(inspection.findings) or 'no'} finding{'' if len(inspection.findings) == 1 else 's'}"]
     for finding in inspection.findings:
-        title = f"{finding.check.title} ({finding.check.certainty})"
-        remedies = "\n".join(f"{remedy.title}:\n[dim]{escape(remedy.line)}[/]" for remedy in finding.remedies)
-        table.add_row(title, finding.measured(), remedies)
-    return table
+        lines += ["", f"{finding.check.title} ({finding.check.certainty}: {finding.check.name})", f"  {finding.measured()}"]
+        for remedy in finding.remedies:
+            lines += [f"  Try {remedy.title}:", *(f"      {line}" for line in remedy.line.splitlines())]
+    return "\n".join(lines)
 
 
 def _distances(a: Inspection, b: Inspection) -> Table:

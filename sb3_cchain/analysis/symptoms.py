@@ -1,6 +1,7 @@
 """What the doctor measures in a model: how it acts, its units and weights, its values, its updates."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ Symptoms = dict[str, float]
 SATURATED = 0.99
 # Greatest score of a unit that is dormant, Sokar et al. (2023)
 DORMANT = 0.025
+# Groups of layers that end in values
+_OF_VALUES = re.compile("value_net|critic|q_net|quantile_net")
 _BOUNDED_UNITS: dict[type[nn.Module], tuple[float, float]] = {nn.Tanh: (-1.0, 1.0), nn.Sigmoid: (0.0, 1.0)}
 
 
@@ -143,12 +146,13 @@ def action_std(model: BaseAlgorithm, batch: Batch) -> th.Tensor | None:
 def network_symptoms(model: BaseAlgorithm, batch: Batch) -> Symptoms:
     r"""
     What is in the networks. The first three are of the units behind the activation functions that
-    :func:`~sb3_cchain.analysis.health.network_health` finds, and are given for each group of layers.
+    :func:`~sb3_cchain.analysis.health.network_health` finds, and are given for each group of layers or each layer.
 
     - ``dormant_units``: share of the units with a score of at most 0.025 (Sokar et al., ICML 2023,
       https://arxiv.org/abs/2302.12902)
     - ``saturated_units``: share of the pairs of unit and observation with an output within 1 % of a bound of its activation
-      function, for tanh and sigmoid
+      function, for each layer of tanh or sigmoid units. Not for the last hidden layer before values: where values are large,
+      it is saturated in healthy models, too.
     - ``feature_rank``: :func:`~sb3_cchain.analysis.metrics.rank.srank` with δ = 0.01 of the features of a group, their mean
       over the batch taken off; 0 where the features are the same for all observations. Not for a single feature.
     - ``weight_gain``: for each weight matrix, :math:`\sqrt{n}` times the root mean square of its entries, for n inputs: what
@@ -162,6 +166,7 @@ def network_symptoms(model: BaseAlgorithm, batch: Batch) -> Symptoms:
     policy = uncompiled(model.policy)
     flags: dict[str, list[th.Tensor]] = {}
     features: dict[str, th.Tensor] = {}
+    last_of_values: dict[str, str] = {}
     for name, outputs in hidden_activations(policy, batch["observations"]).items():
         module, group = policy.get_submodule(name), group_of(name)
         for output in outputs:
@@ -170,8 +175,12 @@ def network_symptoms(model: BaseAlgorithm, batch: Batch) -> Symptoms:
             if type(module) in _BOUNDED_UNITS:
                 low, high = _BOUNDED_UNITS[type(module)]
                 distance = (output - (low + high) / 2).abs() / ((high - low) / 2)
-                flags.setdefault(f"saturated_units/{group}", []).append(distance > SATURATED)
+                flags.setdefault(f"saturated_units/{name}", []).append(distance > SATURATED)
+            if _OF_VALUES.search(group):
+                last_of_values[group] = name
             features[group] = output.flatten(start_dim=1)  # the last one stays
+    for name in last_of_values.values():
+        flags.pop(f"saturated_units/{name}", None)
     symptoms = {name: th.cat([flag.flatten() for flag in layers]).float().mean().item() for name, layers in flags.items()}
     for group, matrix in features.items():
         if matrix.isfinite().all() and min(matrix.shape) > 1:

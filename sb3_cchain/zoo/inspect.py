@@ -19,7 +19,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.analysis.findings import BY_NAME, CERTAINTIES
-from sb3_cchain.analysis.inspection import Inspection, findings_table, inspect_model, plot, report
+from sb3_cchain.analysis.inspection import Inspection, findings_text, inspect_model, plot, report
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.checkpoint import check_model_file, check_writable
@@ -224,10 +224,7 @@ def main(arguments: Sequence[str]) -> int:
     for table in report(inspections):
         console.print(table)
     for inspection in inspections:
-        if inspection.findings:
-            console.print(findings_table(inspection))
-        else:
-            console.print(f"{inspection.name}: no findings", soft_wrap=True)
+        console.print(f"\n{findings_text(inspection)}\n", markup=False, highlight=False, soft_wrap=True)
     try:
         written = _write(args, inspections)
     except OSError as error:
