@@ -140,8 +140,8 @@ CHOSEN_ON: dict[str, Case] = {
     "dqn_cartpole": Case(DQN, "CartPole-v1", (5000, 30_000), {**DQN_CARTPOLE, **BIG}),
     "ppo_pendulum": Case(PPO, "Pendulum-v1", (4096, 16_384), PPO_PENDULUM, n_envs=4),
     "sac_pendulum": Case(SAC, "Pendulum-v1", (1000, 2500), SAC_PENDULUM),
-    "td3_pendulum": Case(TD3, "Pendulum-v1", (1500, 3500), {**TD3_PENDULUM, **_noise(0.1), "learning_starts": 1000}),
-    "trpo_cartpole": Case(TRPO, "CartPole-v1", (4096, 10_240), {"n_steps": 512, "batch_size": 512}, n_envs=2),
+    "td3_pendulum": Case(TD3, "Pendulum-v1", (1500, 2500), {**TD3_PENDULUM, **_noise(0.1), "learning_starts": 1000}),
+    "trpo_cartpole": Case(TRPO, "CartPole-v1", (4096, 8192), {"n_steps": 512, "batch_size": 512}, n_envs=2),
     # Sick
     "ppo_cartpole_rate": Case(
         *(
@@ -254,49 +254,49 @@ CHOSEN_ON: dict[str, Case] = {
 
 HELD_OUT: dict[str, Case] = {
     # Healthy: other environments
-    "ppo_acrobot": Case(PPO, "Acrobot-v1", (4096, 30_720), PPO_ACROBOT, **NORMALIZED, seed=2),
-    "ppo_acrobot_sb3": Case(PPO, "Acrobot-v1", (6144,), seed=2),
-    "a2c_acrobot": Case(A2C, "Acrobot-v1", (6000, 24_000), {"ent_coef": 0.0}, **NORMALIZED, seed=2),
-    "dqn_acrobot": Case(DQN, "Acrobot-v1", (4000, 10_000), {**DQN_ACROBOT, **SMALL}, seed=2),
+    "ppo_acrobot": Case(PPO, "Acrobot-v1", (4096, 16_384), PPO_ACROBOT, **NORMALIZED, seed=2),
+    "ppo_acrobot_sb3": Case(PPO, "Acrobot-v1", (4096,), seed=2),
+    "a2c_acrobot": Case(A2C, "Acrobot-v1", (6000, 16_000), {"ent_coef": 0.0}, **NORMALIZED, seed=2),
+    "dqn_acrobot": Case(DQN, "Acrobot-v1", (3000, 8000), {**DQN_ACROBOT, **SMALL}, seed=2),
     "qrdqn_acrobot": Case(
-        QRDQN, "Acrobot-v1", (5000,), {**DQN_ACROBOT, "policy_kwargs": {"net_arch": [64, 64], "n_quantiles": 25}}
+        QRDQN, "Acrobot-v1", (3000,), {**DQN_ACROBOT, "policy_kwargs": {"net_arch": [64, 64], "n_quantiles": 25}}
     ),
-    "ppo_mountain_car": Case(PPO, "MountainCar-v0", (8000, 30_000), PPO_MOUNTAIN_CAR, n_envs=16, normalize=True),
-    "dqn_mountain_car": Case(DQN, "MountainCar-v0", (6000, 20_000), {**DQN_MOUNTAIN_CAR, **SMALL}),
-    "sac_mountain_car": Case(SAC, "MountainCarContinuous-v0", (2000, 4000), SAC_MCC),
+    "ppo_mountain_car": Case(PPO, "MountainCar-v0", (6000, 16_000), PPO_MOUNTAIN_CAR, n_envs=16, normalize=True),
+    "dqn_mountain_car": Case(DQN, "MountainCar-v0", (5000, 12_000), {**DQN_MOUNTAIN_CAR, **SMALL}),
+    "sac_mountain_car": Case(SAC, "MountainCarContinuous-v0", (1000, 2000), SAC_MCC),
     "trpo_mountain_car": Case(
-        TRPO, "MountainCarContinuous-v0", (8000,), {"use_sde": True, "sde_sample_freq": 4}, n_envs=2, normalize=True
+        TRPO, "MountainCarContinuous-v0", (4096,), {"use_sde": True, "sde_sample_freq": 4}, n_envs=2, normalize=True
     ),
     # Healthy: other seeds and other algorithms
-    "ppo_cartpole_seed_1": Case(PPO, "CartPole-v1", (6000, 24_000), PPO_CARTPOLE, n_envs=8, seed=1),
-    "ppo_pendulum_seed_1": Case(PPO, "Pendulum-v1", (4096, 16_384), PPO_PENDULUM, n_envs=4, seed=1),
-    "a2c_cartpole_seed_1": Case(A2C, "CartPole-v1", (24_000,), {"ent_coef": 0.0}, n_envs=8, seed=1),
-    "sac_pendulum_seed_1": Case(SAC, "Pendulum-v1", (2500,), SAC_PENDULUM, seed=1),
-    "ddpg_pendulum": Case(DDPG, "Pendulum-v1", (2500,), {**TD3_PENDULUM, **_noise(0.1), "learning_starts": 1000}, seed=1),
-    "tqc_pendulum": Case(TQC, "Pendulum-v1", (1500,), SAC_PENDULUM, seed=1),
-    "crossq_pendulum": Case(CrossQ, "Pendulum-v1", (1500,), {"policy_kwargs": {"net_arch": [64, 64]}}, seed=1),
+    "ppo_cartpole_seed_1": Case(PPO, "CartPole-v1", (5000, 16_000), PPO_CARTPOLE, n_envs=8, seed=1),
+    "ppo_pendulum_seed_1": Case(PPO, "Pendulum-v1", (8192,), PPO_PENDULUM, n_envs=4, seed=1),
+    "a2c_cartpole_seed_1": Case(A2C, "CartPole-v1", (16_000,), {"ent_coef": 0.0}, n_envs=8, seed=1),
+    "sac_pendulum_seed_1": Case(SAC, "Pendulum-v1", (2000,), SAC_PENDULUM, seed=1),
+    "ddpg_pendulum": Case(DDPG, "Pendulum-v1", (2000,), {**TD3_PENDULUM, **_noise(0.1), "learning_starts": 1000}, seed=1),
+    "tqc_pendulum": Case(TQC, "Pendulum-v1", (1000,), SAC_PENDULUM, seed=1),
+    "crossq_pendulum": Case(CrossQ, "Pendulum-v1", (1000,), {"policy_kwargs": {"net_arch": [64, 64]}}, seed=1),
     "qrdqn_cartpole": Case(
-        *(QRDQN, "CartPole-v1", (6000,)),
+        *(QRDQN, "CartPole-v1", (5000,)),
         {**DQN_CARTPOLE, "policy_kwargs": {"net_arch": [256, 256], "n_quantiles": 10}},
         seed=1,
     ),
     "recurrent_ppo_cartpole": Case(
-        *(RecurrentPPO, "CartPole-v1", (6000,)),
+        *(RecurrentPPO, "CartPole-v1", (3000,)),
         {**PPO_CARTPOLE, "n_epochs": 5, "policy_kwargs": {"lstm_hidden_size": 32}},
         n_envs=8,
         policy="MlpLstmPolicy",
         seed=1,
     ),
     "maskable_ppo_cartpole": Case(
-        MaskablePPO, "CartPole-v1", (12_000,), PPO_CARTPOLE, n_envs=8, wrap=_all_actions_allowed, seed=1
+        MaskablePPO, "CartPole-v1", (8000,), PPO_CARTPOLE, n_envs=8, wrap=_all_actions_allowed, seed=1
     ),
-    "ars_cartpole": Case(ARS, "CartPole-v1", (6000,), {"n_delta": 2}, policy="LinearPolicy", seed=1),
+    "ars_cartpole": Case(ARS, "CartPole-v1", (3000,), {"n_delta": 2}, policy="LinearPolicy", seed=1),
     # Sick
     "ppo_acrobot_rate": Case(
         *(
             PPO,
             "Acrobot-v1",
-            (10_000,),
+            (8192,),
             {**PPO_ACROBOT, "learning_rate": 0.1},
             ("collapsed_policy", "no_exploration", "vanishing_gradients"),
         ),
@@ -304,110 +304,110 @@ HELD_OUT: dict[str, Case] = {
         n_envs=8,
     ),
     "a2c_acrobot_rate": Case(
-        *(A2C, "Acrobot-v1", (12_000,), {"learning_rate": 0.1}, ("collapsed_policy", "no_exploration", "vanishing_gradients")),
+        *(A2C, "Acrobot-v1", (8000,), {"learning_rate": 0.1}, ("collapsed_policy", "no_exploration", "vanishing_gradients")),
         cause="learning rate 0.1",
         n_envs=8,
     ),
     "dqn_acrobot_rate": Case(
-        *(DQN, "Acrobot-v1", (5000,), {**DQN_ACROBOT, **SMALL, "learning_rate": 0.3}, ("exploding_weights",)),
+        *(DQN, "Acrobot-v1", (3000,), {**DQN_ACROBOT, **SMALL, "learning_rate": 0.3}, ("exploding_weights",)),
         cause="learning rate 0.3",
     ),
     "a2c_acrobot_growth": Case(
-        *(A2C, "Acrobot-v1", (24_000,), GROWTH, ("exploding_weights",)), cause="SGD at learning rate 100", n_envs=8
+        *(A2C, "Acrobot-v1", (10_000,), GROWTH, ("exploding_weights",)), cause="SGD at learning rate 100", n_envs=8
     ),
     "dqn_mountain_car_growth": Case(
-        *(DQN, "MountainCar-v0", (6000,), {**DQN_MOUNTAIN_CAR, **GROWTH}, ("exploding_weights",)),
+        *(DQN, "MountainCar-v0", (4000,), {**DQN_MOUNTAIN_CAR, **GROWTH}, ("exploding_weights",)),
         cause="SGD at learning rate 100",
     ),
     "ppo_acrobot_updates": Case(
-        *(PPO, "Acrobot-v1", (6000,), {**PPO_ACROBOT, "clip_range": 100.0, "n_epochs": 40, "learning_rate": 5e-3}),
+        *(PPO, "Acrobot-v1", (4096,), {**PPO_ACROBOT, "clip_range": 100.0, "n_epochs": 40, "learning_rate": 5e-3}),
         expected=("too_large_updates",),
         cause="40 epochs at learning rate 5e-3, without clipping",
         n_envs=8,
     ),
     "ppo_acrobot_paid": Case(
-        *(PPO, "Acrobot-v1", (20_000,), {**PPO_ACROBOT, "learning_rate": 1e-3}, ("collapsed_policy", "no_exploration")),
+        *(PPO, "Acrobot-v1", (16_000,), {**PPO_ACROBOT, "learning_rate": 1e-3}, ("collapsed_policy", "no_exploration")),
         cause="a reward for one action, a penalty for the others",
         n_envs=8,
         wrap=partial(_pay_for, 1),
     ),
     "ppo_acrobot_entropy": Case(
-        *(PPO, "Acrobot-v1", (20_000,), {**PPO_ACROBOT, "learning_rate": 1e-3, "ent_coef": -0.5}, ("no_exploration",)),
+        *(PPO, "Acrobot-v1", (12_000,), {**PPO_ACROBOT, "learning_rate": 1e-3, "ent_coef": -0.5}, ("no_exploration",)),
         cause="ent_coef = -0.5",
         **NORMALIZED,
     ),
     "ppo_acrobot_reward": Case(
-        *(PPO, "Acrobot-v1", (10_000,), PPO_ACROBOT, ("large_rewards",)), cause="rewards times 10 000", n_envs=8, wrap=X10000
+        *(PPO, "Acrobot-v1", (6000,), PPO_ACROBOT, ("large_rewards",)), cause="rewards times 10 000", n_envs=8, wrap=X10000
     ),
     "dqn_mountain_car_reward": Case(
-        *(DQN, "MountainCar-v0", (6000,), {**DQN_MOUNTAIN_CAR, **SMALL}, ("large_rewards",)),
+        *(DQN, "MountainCar-v0", (4000,), {**DQN_MOUNTAIN_CAR, **SMALL}, ("large_rewards",)),
         cause="rewards times 10 000",
         wrap=X10000,
     ),
     "sac_mountain_car_reward": Case(
-        *(SAC, "MountainCarContinuous-v0", (1500,), SAC_MCC, ("large_rewards",)), cause="rewards times 10 000", wrap=X10000
+        *(SAC, "MountainCarContinuous-v0", (1000,), SAC_MCC, ("large_rewards",)), cause="rewards times 10 000", wrap=X10000
     ),
     "ppo_acrobot_dead": Case(
-        *(PPO, "Acrobot-v1", (8000,), {**PPO_ACROBOT, **RELU}),
+        *(PPO, "Acrobot-v1", (6000,), {**PPO_ACROBOT, **RELU}),
         expected=("dormant_units", "rank_collapse", "dead_values", "vanishing_gradients"),
         cause="biases of ReLU units moved by -40",
         n_envs=8,
         prepare=partial(_shift_biases, -40.0),
     ),
     "dqn_mountain_car_dead": Case(
-        *(DQN, "MountainCar-v0", (6000,), {**DQN_MOUNTAIN_CAR, **SMALL}),
+        *(DQN, "MountainCar-v0", (4000,), {**DQN_MOUNTAIN_CAR, **SMALL}),
         expected=("dormant_units", "rank_collapse", "dead_values", "vanishing_gradients"),
         cause="biases of ReLU units moved by -10",
         prepare=partial(_shift_biases, -10.0),
     ),
     "a2c_acrobot_deep": Case(
-        *(A2C, "Acrobot-v1", (8000,), {"policy_kwargs": {"net_arch": [32] * 12, "activation_fn": nn.Sigmoid}}),
+        *(A2C, "Acrobot-v1", (4000,), {"policy_kwargs": {"net_arch": [32] * 12, "activation_fn": nn.Sigmoid}}),
         expected=("vanishing_gradients",),
         cause="twelve layers of sigmoids",
         n_envs=8,
     ),
     "ppo_acrobot_observations": Case(
-        *(PPO, "Acrobot-v1", (8000,), PPO_ACROBOT, ("saturated_units",)),
+        *(PPO, "Acrobot-v1", (6000,), PPO_ACROBOT, ("saturated_units",)),
         cause="observations times 1000",
         n_envs=8,
         wrap=partial(_observations_times, 1000.0),
     ),
     "dqn_acrobot_gamma": Case(
-        DQN, "Acrobot-v1", (5000,), {**DQN_ACROBOT, **SMALL, "gamma": 0.0}, ("short_horizon",), cause="γ = 0"
+        DQN, "Acrobot-v1", (3000,), {**DQN_ACROBOT, **SMALL, "gamma": 0.0}, ("short_horizon",), cause="γ = 0"
     ),
     "ppo_acrobot_values": Case(
-        *(PPO, "Acrobot-v1", (16_000,), {**PPO_ACROBOT, "vf_coef": 0.0}, ("vanishing_gradients",)),
+        *(PPO, "Acrobot-v1", (8192,), {**PPO_ACROBOT, "vf_coef": 0.0}, ("vanishing_gradients",)),
         cause="vf_coef = 0",
         **NORMALIZED,
     ),
     "dqn_acrobot_greedy": Case(
-        *(DQN, "Acrobot-v1", (5000,)),
+        *(DQN, "Acrobot-v1", (3000,)),
         {**DQN_ACROBOT, **SMALL, "exploration_initial_eps": 0.0, "exploration_final_eps": 0.0},
         expected=("no_exploration",),
         cause="ε = 0",
     ),
     "ddpg_mountain_car_greedy": Case(
-        *(DDPG, "MountainCarContinuous-v0", (1500,), TD3_PENDULUM, ("no_exploration",)), cause="no action noise"
+        *(DDPG, "MountainCarContinuous-v0", (1000,), TD3_PENDULUM, ("no_exploration",)), cause="no action noise"
     ),
     "ppo_pendulum_std": Case(
-        *(PPO, "Pendulum-v1", (8192,), {"gamma": 0.9, "policy_kwargs": {"log_std_init": -8.0}}, ("no_exploration",)),
+        *(PPO, "Pendulum-v1", (4096,), {"gamma": 0.9, "policy_kwargs": {"log_std_init": -8.0}}, ("no_exploration",)),
         cause="log_std_init = -8",
         n_envs=4,
         seed=1,
     ),
     "ddpg_pendulum_rate": Case(
-        *(DDPG, "Pendulum-v1", (1500,), {**TD3_PENDULUM, **_noise(0.1), "learning_rate": 0.1}),
+        *(DDPG, "Pendulum-v1", (1000,), {**TD3_PENDULUM, **_noise(0.1), "learning_rate": 0.1}),
         expected=("saturated_actions",),
         cause="learning rate 0.1",
         seed=1,
     ),
     "td3_mountain_car_rate": Case(
-        *(TD3, "MountainCarContinuous-v0", (1500,), {**TD3_PENDULUM, **_noise(0.5), "learning_rate": 0.1}),
+        *(TD3, "MountainCarContinuous-v0", (1000,), {**TD3_PENDULUM, **_noise(0.5), "learning_rate": 0.1}),
         expected=("saturated_actions",),
         cause="learning rate 0.1",
     ),
     "tqc_pendulum_fixed_targets": Case(
-        *(TQC, "Pendulum-v1", (1500,), {**SAC_PENDULUM, "tau": 1.0, "learning_rate": 0.02, "gamma": 0.9999}),
+        *(TQC, "Pendulum-v1", (1000,), {**SAC_PENDULUM, "tau": 1.0, "learning_rate": 0.02, "gamma": 0.9999}),
         expected=("diverged_values",),
         cause="τ = 1, γ = 0.9999 and learning rate 0.02",
         seed=1,

@@ -1,6 +1,5 @@
 """The models: trained once, and kept."""
 
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,12 +110,11 @@ class SaveAtAges(BaseCallback):
         save_model(self.model, patient.path)
 
 
-def train_missing(wanted: list[Patient]) -> Iterator[str]:
+def train_missing(wanted: list[Patient]) -> None:
     """
     Train the models that are not there.
 
     :param wanted: Models
-    :return: The name of each training, as soon as it is done
     """
     for name in dict.fromkeys(patient.case_name for patient in wanted if not patient.path.exists()):
         case = CASES[name]
@@ -124,7 +122,6 @@ def train_missing(wanted: list[Patient]) -> Iterator[str]:
         model.learn(max(case.ages), callback=SaveAtAges([patient for patient in wanted if patient.case_name == name]))
         assert model.env is not None
         model.env.close()
-        yield name
 
 
 def make_model(case: Case) -> BaseAlgorithm:

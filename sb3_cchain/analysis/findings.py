@@ -96,8 +96,8 @@ CHECKS = (
     ),
     Check(
         *("saturated_units", "Hidden units are saturated", "saturated_units", "above", 0.5, "likely"),
-        "Share of the outputs of tanh and sigmoid units within 1 % of a bound, in the worst layer (but for the last one before "
-        "values). They pass hardly any gradient. Often the observations are large, or the learning rate is.",
+        "Share of the outputs of tanh and sigmoid units within 1 % of a bound, in the worst layer (but for the last one "
+        "before values). They pass hardly any gradient. Often the observations are large, or the learning rate is.",
         OWN,
         (r.NORMALIZE, r.SMALLER_RATE, r.LAYER_NORM, r.RELU, r.CLIPPING),
     ),

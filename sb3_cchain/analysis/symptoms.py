@@ -41,7 +41,7 @@ def acting_symptoms(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -
 
     - ``action_diversity``: how different its actions are over the batch's observations, from 0 (always the same) to 1 (all
       equally often). Of actions that are chosen from a list, the entropy of how often each is taken, divided by that of a
-      uniform choice; of continuous ones, their standard deviation, divided by half their range.
+      uniform choice; of continuous ones, their standard deviation, divided by half their range, which may be more than 1.
     - ``exploration``: the same, but what of it is chance, for one observation: the mean entropy, the standard deviation of the
       distribution or of the action noise, or, of DQN and QRDQN, ε. Not for ARS, and not for action noise of unknown kinds.
     - ``saturated_actions``: share of continuous actions that are, before noise, within 1 % of a bound or beyond it
