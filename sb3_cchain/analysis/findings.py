@@ -70,20 +70,20 @@ class Check:
         return part, values[part]
 
 
-OWN = "own validation"
+OWN = "own validation (benchmarks.doctor)"
 
 CHECKS = (
     Check(
         *("collapsed_policy", "The policy always takes the same action", "action_diversity", "below", 0.02, "possible"),
-        "Over the observations it met, its actions differ by this much, noise included: 0 is one action for everything, 1 all "
-        "actions alike. Such an agent no longer reacts to what it sees, and collects data of one kind.",
+        "How much its actions differ over the observations that it met, noise included: 0 where it always takes the same one, "
+        "1 where it takes all equally often. Such an agent no longer reacts to what it sees, and collects data of one kind.",
         OWN,
         (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.SMALLER_RATE, r.CCHAIN, r.LAYER_RESET),
     ),
     Check(
         *("no_exploration", "The agent does not explore", "exploration", "below", 0.01, "possible"),
-        "What is chance in its actions: the entropy of the policy, its standard deviation, the action noise or ε, each as a "
-        "share of the range. At the end of training it is wanted; before, nothing new is tried.",
+        "How much of its actions is chance: the entropy or standard deviation of the policy, the action noise or ε, each as a "
+        "share of the greatest possible. At the end of training it is wanted; before, nothing new is tried.",
         f"SB3's and RL Zoo's settings: action noise of 0.1 or more, ε of 0.04 or more; for policies {OWN}",
         (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.ACTION_NOISE),
     ),

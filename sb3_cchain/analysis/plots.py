@@ -92,6 +92,8 @@ def plot_models(
             axes.set_title(title, fontsize=10)
             axes.spines[["top", "right"]].set_visible(False)
             axes.margins(x=0.1)
+            axes.set_xlim(left=0)
+            axes.locator_params(axis="x", nbins=4)
         axes.invert_yaxis()
         if len(names) > 1:
             below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)

@@ -24,7 +24,8 @@ _PAGE = Template("""<!DOCTYPE html>
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 1.5rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; }
 h2 { font-size: 1.25rem; margin-top: 2.5rem; overflow-wrap: anywhere; }
-h3 { margin: 0; font-size: 1.05rem; }
+h3 { margin: 1.5rem 0 0; font-size: 1.05rem; }
+.finding h3 { margin: 0; }
 .verdict, .finding { border-left: 0.4rem solid var(--well); padding: 0.1rem 0 0.1rem 0.9rem; margin: 1rem 0; }
 .likely { border-color: var(--ill); } .possible { border-color: var(--maybe); }
 .verdict { font-size: 1.1rem; font-weight: 600; }
@@ -32,11 +33,12 @@ h3 { margin: 0; font-size: 1.05rem; }
 .ill { color: var(--ill); font-weight: 600; } .maybe { color: var(--maybe); font-weight: 600; } .well { color: var(--well); }
 pre { overflow-x: auto; padding: 0.6rem; margin: 0.3rem 0; border: 1px solid var(--line); border-radius: 4px; }
 pre { font-size: 0.85rem; }
-.table { overflow-x: auto; }
+.wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.6rem 0.3rem 0; border-bottom: 1px solid var(--line); }
 td small { overflow-wrap: anywhere; }
-img { max-width: 100%; background: white; border-radius: 4px; }
+/* Narrow screens scroll the picture, whose text would be too small */
+img { width: 100%; min-width: 42rem; background: white; border-radius: 4px; }
 summary { cursor: pointer; }
 </style>
 </head>
@@ -105,7 +107,7 @@ def _finding(finding: Finding) -> str:
 def _measures(inspection: Inspection) -> str:
     rows = "\n".join(_measure(check, inspection) for check in CHECKS)
     header = "<tr><th>measure</th><th>value</th><th>healthy</th></tr>"
-    return f'<div class="table"><table>{header}\n{rows}</table></div>'
+    return f'<div class="wide"><table>{header}\n{rows}</table></div>'
 
 
 def _measure(check: Check, inspection: Inspection) -> str:
@@ -129,4 +131,5 @@ def _picture(inspections: Sequence[Inspection]) -> str:
     kernels = "The neural tangent kernel as a matrix, and bars" if any(i.ntk is not None for i in inspections) else "Bars"
     what = f"{kernels} of the units, the features and the weights of each group of layers."
     names = " and ".join(inspection.name for inspection in inspections)
-    return f'<h2>The networks</h2>\n<p>{what}</p>\n<img alt="{escape(f"{names}: {what}")}" src="data:image/png;base64,{data}">'
+    image = f'<img alt="{escape(f"{names}: {what}")}" src="data:image/png;base64,{data}">'
+    return f'<h2>The networks</h2>\n<p>{what}</p>\n<div class="wide">{image}</div>'

@@ -252,8 +252,9 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
         # Of settings that name what is not there
         *(AttributeError, ImportError, NameError, SyntaxError),
     ) as error:
+        where = f"{args.env} {env_kwargs}" if env_kwargs else args.env
         message = " ".join(str(error).split())  # in one line
-        parser.error(f"{path} in {args.env} {env_kwargs or ''}: {message}")
+        parser.exit(2, f"{parser.prog}: error: {path} in {where}: {message}\n")
     if model.lr_schedule(model._current_progress_remaining) == 0:
         console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
     model.set_random_seed(args.seed)
