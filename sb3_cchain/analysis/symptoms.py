@@ -55,13 +55,16 @@ def acting_symptoms(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -
     exploration = _exploration(model, batch, outputs)
     if outputs.action_means is not None:
         low, high, scale = _bounds(model)
-        actions = outputs.action_means.clamp(low, high)
+        means = outputs.action_means
+        if model.policy.squash_output and isinstance(model, OnPolicyAlgorithm):
+            means = means.tanh()
+        actions = means.clamp(low, high)
         spread = actions.var(dim=0, unbiased=False)
         noise = th.zeros_like(low) if exploration is None else exploration * th.ones_like(low)
         symptoms["action_diversity"] = ((spread / scale**2 + noise**2).sqrt()).mean().item()
         if low.isfinite().all() and high.isfinite().all():
             middle = (low + high) / 2
-            beyond = ((outputs.action_means - middle) / scale).abs() > SATURATED
+            beyond = ((means - middle) / scale).abs() > SATURATED
             symptoms["saturated_actions"] = beyond.float().mean().item()
     else:
         symptoms["action_diversity"] = _diversity(model, outputs)

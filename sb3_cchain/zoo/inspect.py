@@ -3,7 +3,9 @@
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +220,9 @@ def main(arguments: Sequence[str]) -> int:
     check_arguments(parser, args)
     names = ["A", "B"] if len(args.models) == 2 else [args.models[0].stem]
     console = Console(stderr=args.json)
-    inspections = [_inspect(parser, args, name, path, console) for name, path in zip(names, args.models, strict=True)]
+    # RL Zoo prints how it makes an environment
+    with redirect_stdout(sys.stderr) if args.json else nullcontext():
+        inspections = [_inspect(parser, args, name, path, console) for name, path in zip(names, args.models, strict=True)]
     for inspection in inspections:
         inspection.findings = [finding for finding in inspection.findings if finding.check.name not in args.ignore]
     for table in report(inspections):
