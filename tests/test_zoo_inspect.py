@@ -5,11 +5,16 @@ import os
 import re
 import zipfile
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 import yaml
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.wrappers import ActionMasker
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.save_util import save_to_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_cchain.zoo.inspect
 from sb3_cchain import CChainPPO
@@ -203,6 +208,29 @@ def test_a_model_that_is_not_finite_is_found_and_not_refused(tmp_path, monkeypat
     assert exit_info.value.code == 3
     assert "weight gain inf in value_net.weight" in page.read_text() and "Findings: 1 likely" in page.read_text()
     assert "The weights have grown huge" in " ".join(capsys.readouterr().out.split())
+
+
+def test_statistics_of_vec_normalize(tmp_path, monkeypatch, capsys):
+    model = make()
+    model.save(tmp_path / "model.zip")
+    normalize = VecNormalize(model.env)
+    normalize.obs_rms.mean += 7
+    normalize.save(tmp_path / "statistics.pkl")
+    monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", lambda model, *_: (_ for _ in ()).throw(Started(model)))
+    arguments = ["--output", tmp_path, "--vec-normalize", tmp_path / "statistics.pkl"]
+    with pytest.raises(Started) as started:
+        command("inspect", tmp_path / "model.zip", "--env", "CartPole-v1", *arguments)
+    assert (started.value.args[0].get_vec_normalize_env().obs_rms.mean == 7).all()
+    (tmp_path / "statistics.pkl").write_text("none")
+    assert "statistics.pkl cannot be read" in error_of(capsys, tmp_path / "model.zip", *arguments)
+    (tmp_path / "statistics.pkl").unlink()
+    assert "no such file" in error_of(capsys, tmp_path / "model.zip", *arguments)
+
+
+def test_maskable_ppo_needs_masks(tmp_path, capsys):
+    env = ActionMasker(gym.make("CartPole-v1"), lambda _: np.ones(2, dtype=bool))
+    MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=8).save(tmp_path / "model.zip")
+    assert "has no method `action_masks`" in error_of(capsys, tmp_path / "model.zip", "--output", tmp_path)
 
 
 def test_a_page_that_cannot_be_written(tmp_path, capsys):

@@ -14,11 +14,13 @@ import yaml
 from rich.console import Console
 from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict, create_test_env, get_callback_list, get_saved_hyperparams
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.analysis.findings import BY_NAME, CERTAINTIES
 from sb3_cchain.analysis.inspection import Inspection, findings_text, inspect_model, plot, report
@@ -66,7 +68,14 @@ def make_as_trained(
 
 
 def load_as_trained(
-    path: Path, algo: str | None, env_id: str, env_kwargs: dict[str, Any], seed: int, n_steps: int, device: str
+    path: Path,
+    algo: str | None,
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    seed: int,
+    n_steps: int,
+    device: str,
+    statistics: Path | None = None,
 ) -> tuple[BaseAlgorithm, list[BaseCallback]]:
     """
     Load a model with the environment that it was trained in.
@@ -78,8 +87,9 @@ def load_as_trained(
     :param seed: Seed of the environment
     :param n_steps: Size of the replay buffer, for off-policy algorithms
     :param device: PyTorch device
+    :param statistics: What ``VecNormalize.save()`` wrote, for a model that is in no folder of RL Zoo's
     :return: The model, and the callbacks of its settings
-    :raises ValueError: When the file is no whole model or one of another algorithm
+    :raises ValueError: When the file is no whole model or one of another algorithm, or the statistics cannot be read
     """
     check_model_file(path)
     try:
@@ -91,6 +101,11 @@ def load_as_trained(
     if algo:
         check_algorithm(path, data, algo)
     env, callbacks = make_as_trained(path, env_id, data.get("n_envs", 1), seed, env_kwargs)
+    if statistics is not None:
+        try:
+            env = VecNormalize.load(str(statistics), env)
+        except Exception as error:  # whatever reading a pickle raises
+            raise ValueError(f"--vec-normalize {statistics} cannot be read: {error!r}") from error
     settings: dict[str, Any] = {"buffer_size": n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
     try:
         model = algorithm.load(path, env, device=device, **settings)
@@ -99,6 +114,8 @@ def load_as_trained(
         raise ValueError(
             f"it cannot be loaded as {algorithm.__name__}: {error!r}. Give the --algo that it was saved by"
         ) from error
+    if isinstance(model, MaskablePPO) and not is_masking_supported(env):
+        raise ValueError("its algorithm is MaskablePPO, but the environment has no method `action_masks`")
     return model, callbacks
 
 
@@ -148,6 +165,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--task", type=int, help="Task of a continual environment, by default the one that training would go on with"
     )
+    parser.add_argument(
+        "--vec-normalize",
+        type=Path,
+        metavar="STATS.pkl",
+        help="Statistics that VecNormalize.save() wrote, for a model that is in no folder of RL Zoo's",
+    )
     parser.add_argument("--algo", choices=sorted(ALGOS), help="Algorithm, by default the one that the file tells")
     parser.add_argument(
         "--n-steps",
@@ -194,7 +217,7 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for option, number in (("--n-steps", args.n_steps), ("--n-updates", args.n_updates)):
         if number < 1:
             parser.error(f"{option} must be at least 1; got {number}")
-    for path in args.models:
+    for path in [*args.models, *([args.vec_normalize] if args.vec_normalize else [])]:
         if not path.is_file():
             parser.error(f"no such file: {path}")
     try:
@@ -250,7 +273,9 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
     if args.task is not None:  # and long enough to stay there, however long the model was trained
         env_kwargs = {**env_kwargs, "first_task": args.task, "steps_per_task": 10**9}
     try:
-        model, callbacks = load_as_trained(path, args.algo, args.env, env_kwargs, args.seed, args.n_steps, args.device)
+        model, callbacks = load_as_trained(
+            path, args.algo, args.env, env_kwargs, args.seed, args.n_steps, args.device, args.vec_normalize
+        )
     except (
         *(TypeError, ValueError, yaml.YAMLError, gym.error.Error),
         # Of settings that name what is not there
