@@ -318,12 +318,30 @@ def test_the_lines_of_remedies_run(name):
     for algorithm in remedy.algorithms:
         cls = BY_CLASS_NAME[algorithm]
         model = make(cls, **(dict(n_steps=16, batch_size=16) if issubclass(cls, PPO) else {}))
-        assert remedy.is_for(model)
+        assert remedy.is_for(model) or not remedy.is_new(model)
         given = {"env": model.env, "model": model, "total_timesteps": 20, algorithm: cls}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of tiny batches
             exec(remedy.line_for(model), given)
         assert given["model"].policy is not None
+
+
+@pytest.mark.parametrize(
+    "name, model, other",
+    [
+        ("SMALLER_RATE", partial(make, PPO), partial(make, PPO, learning_rate=1e-5)),
+        ("NORMALIZE", partial(make, PPO), lambda: make(PPO, env=VecNormalize(DummyVecEnv([RandomEnv])))),
+        ("RELU", partial(make, PPO), partial(make, PPO, policy_kwargs=dict(activation_fn=nn.ReLU))),
+        ("ENTROPY_BONUS", partial(make, PPO), partial(make, PPO, ent_coef=0.01)),
+        ("ENTROPY_TARGET", partial(make, SAC, ent_coef=0.1), partial(make, SAC)),
+        ("EPSILON", partial(make, DQN, exploration_final_eps=0.0), partial(make, DQN)),
+        ("VALUE_COEF", partial(make, PPO, vf_coef=0.0), partial(make, PPO)),
+        ("SLOW_TARGET", partial(make, TD3, tau=1.0), partial(make, TD3)),
+    ],
+)
+def test_nothing_is_proposed_that_is_there(name, model, other):
+    assert REMEDIES[name].is_for(model()) and not REMEDIES[name].is_for(other())
+    assert not REMEDIES[name].is_for(make(ARS))
 
 
 def test_lines_name_the_policy_for_the_observations():

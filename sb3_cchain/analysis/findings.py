@@ -127,7 +127,7 @@ CHECKS = (
         "Root mean square of the gradient of the worst weight matrix, divided by the ε of its optimiser, at the greatest "
         "update. Far below 1, Adam and RMSprop move these weights much less than the learning rate says.",
         f"The step of Adam for gradients far below ε, Kingma & Ba (2015), arXiv 1412.6980; {OWN}",
-        (r.RELU, r.LAYER_NORM, r.LAYER_NORM_DQN, r.REDO, r.LAYER_RESET, r.NORMALIZE),
+        (r.VALUE_COEF, r.RELU, r.LAYER_NORM, r.LAYER_NORM_DQN, r.REDO, r.LAYER_RESET, r.NORMALIZE),
     ),
     Check(
         *("too_large_updates", "The updates change the policy too much", "policy_change", "above", 0.2, "likely"),
