@@ -181,6 +181,16 @@ def test_a_model_that_is_not_finite_has_one_finding():
     assert json.loads(json.dumps(inspection.to_json(), allow_nan=False))["findings"][0]["value"] is None
 
 
+def test_a_model_that_an_update_breaks():
+    settings = dict(learning_rate=1e38, max_grad_norm=1e30, policy_kwargs=dict(NET, optimizer_class=th.optim.SGD))
+    inspection = inspect_model(make(PPO, **settings))
+    assert "exploding_weights" in {f.check.name for f in inspection.findings if math.isinf(f.value)}
+    assert inspection.symptoms["action_diversity"] > 0.9  # before the update
+    # DQN does not notice. There is no second look at what is infinite
+    (message,) = warned(lambda: make(DQN, **settings).learn(20, callback=Doctor(interval=1, patience=50)))
+    assert "weight gain inf" in message
+
+
 def test_likely_findings_come_first():
     symptoms = {"discount": 0.0, "weight_gain/a": 1.0, "weight_gain/b": 100.0}
     first, second = diagnose(symptoms, make(PPO))

@@ -23,8 +23,7 @@ from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.ntk import has_ntk
 from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.analysis.random_state import unchanged_random_state
-from sb3_cchain.analysis.symptoms import Symptoms, symptoms_of, weight_symptoms
-from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.signal import is_continual
@@ -42,6 +41,8 @@ GROUP_FIGURES = (
     "weight_norm",
     "distance_from_init",
 )
+
+_MONITORS = (ChurnMonitor, Doctor, NetworkHealth, NTKCallback)
 
 # Iterations or episodes until the logger is emptied
 _NEVER = 10**9
@@ -101,8 +102,8 @@ def inspect_model(
     ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
     moment when the model was saved; where the learning rate had come down to 0, there is no churn.
 
-    ARS is not trained, but only rolled out. A model with parameters that are not finite cannot act: of it there are only the
-    findings.
+    ARS is not trained, but only rolled out. A model whose parameters are not finite, or become so in this training, cannot
+    act: of it there are only the findings.
 
     :param model: A model of any algorithm of Stable-Baselines3 and sb3-contrib, with an environment
     :param name: What it is called in reports
@@ -142,17 +143,19 @@ def inspect_model(
     if ntk is not None:
         monitors.append(ntk)
     # The monitors that it was trained with are replaced by those above
-    others = [callback for callback in callbacks if type(callback) not in (*map(type, monitors), NTKCallback)]
+    others = [callback for callback in callbacks if not isinstance(callback, _MONITORS)]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
         others.insert(0, TaskSync())
-    # Schedules keep their present values instead of going to their ends
-    with replaced(model, "_update_current_progress_remaining", lambda *_: None):
-        model.learn(
-            n_steps,
-            callback=[*others, *monitors],
-            log_interval=_NEVER,
-            reset_num_timesteps=False,
-        )
+    try:
+        # Schedules keep their present values instead of going to their ends
+        with replaced(model, "_update_current_progress_remaining", lambda *_: None):
+            model.learn(n_steps, callback=[*others, *monitors], log_interval=_NEVER, reset_num_timesteps=False)
+    except ValueError:
+        if is_finite(model):
+            raise
+        # An update has made parameters infinite, and PyTorch's distributions do not take them
+        symptoms = {**doctor.symptoms, **weight_symptoms(model)}
+        return Inspection(name, {}, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
     figures = {
         tag: float(value)
         for tag, value in model.logger.name_to_value.items()
@@ -187,14 +190,6 @@ def _roll_out(model: BaseAlgorithm, n_steps: int) -> tuple[Symptoms, dict[str, f
     with unchanged_random_state():
         batch = {"observations": obs_as_tensor(np.concatenate(seen), model.device)}
         return symptoms_of(model, batch), _rollout_figures(episodes, len(seen) * env.num_envs)
-
-
-def is_finite(model: BaseAlgorithm) -> bool:
-    """
-    :param model: A model
-    :return: Whether all parameters of its policy are numbers
-    """
-    return all(bool(parameter.isfinite().all()) for parameter in uncompiled(model.policy).parameters())
 
 
 def _check_env(model: BaseAlgorithm) -> None:

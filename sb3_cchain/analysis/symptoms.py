@@ -199,6 +199,14 @@ def _centred_rank(features: th.Tensor) -> float:
     return float(srank(singular_values(centred)))
 
 
+def is_finite(model: BaseAlgorithm) -> bool:
+    """
+    :param model: A model
+    :return: Whether all parameters of its policy are numbers
+    """
+    return all(bool(parameter.isfinite().all()) for parameter in uncompiled(model.policy).parameters())
+
+
 def weight_symptoms(model: BaseAlgorithm) -> Symptoms:
     """
     :param model: A model
