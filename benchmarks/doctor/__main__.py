@@ -2,7 +2,7 @@
 Is the doctor right? Trains healthy and sick models in Gymnasium's classic control, inspects them, and shows how often each
 finding was right and wrong. Models that are there are not trained again, and those in the results not inspected again.
 
-    python -m benchmarks.doctor             # trains and inspects what is missing; about 20 minutes the first time
+    python -m benchmarks.doctor             # trains and inspects what is missing; goes on where it was interrupted
     python -m benchmarks.doctor --again     # inspects all models again, after a change of a measure
     python -m benchmarks.doctor --write     # besides, puts the tables into the documentation
 """

@@ -136,7 +136,14 @@ def confusion_table(examinations: Sequence[Examination]) -> str:
                 hits = sum(any(check.certainty in kinds for check in e.found) for e in models)
                 cells.append(_share(hits, len(models)))
         rows.append([title, "", *cells])
-    header = ["finding", "", "chosen on: found", "false alarms", "held out: found", "false alarms"]
+    header = [
+        "finding",
+        "certainty",
+        "chosen on: found",
+        "chosen on: false alarms",
+        "held out: found",
+        "held out: false alarms",
+    ]
     return markdown_table(header, rows)
 
 
@@ -161,7 +168,7 @@ def wrong_table(examinations: Sequence[Examination]) -> str:
         for check, kind in wrong:
             value = f"{each.worst[check.name]:.3g}" if check.name in each.worst else "not measured"
             rows.append([about, where, kind, f"`{check.name}`", f"{value} ({check.healthy_range()})"])
-    return markdown_table(["model", "", "", "finding", "measured (healthy)"], rows) if rows else "None."
+    return markdown_table(["model", "set", "wrong", "finding", "measured (healthy)"], rows) if rows else "None."
 
 
 def models_table(examinations: Sequence[Examination]) -> str:
@@ -178,4 +185,4 @@ def models_table(examinations: Sequence[Examination]) -> str:
             where = "held out" if each.patient.is_held_out else "chosen on"
             about = f"{case.algorithm.__name__}, {case.env}"
             rows.append([about, case.cause, where, ", ".join([*found, *missed]) or "nothing"])
-    return markdown_table(["model", "what is wrong", "", "found"], rows)
+    return markdown_table(["model", "what is wrong", "set", "found"], rows)

@@ -272,5 +272,9 @@ def findings_markdown() -> str:
         remedies = dict.fromkeys(remedy.title for remedy in check.remedies)
         cells = [f"`{check.name}`", check.certainty, f"{check.title}. {check.meaning}"]
         rows.append([*cells, check.healthy_range(), check.source, "; ".join(remedies)])
-    lines = [["finding", "", "what it means", "healthy", "where the threshold comes from", "what to try"], ["---"] * 6, *rows]
+    lines = [
+        ["finding", "certainty", "what it means", "healthy", "where the threshold comes from", "what to try"],
+        ["---"] * 6,
+        *rows,
+    ]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
