@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -81,10 +82,11 @@ CHECKS = (
         (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.SMALLER_RATE, r.CCHAIN, r.LAYER_RESET),
     ),
     Check(
-        *("no_exploration", "The agent does not explore", "exploration", "below", 0.01, "possible"),
+        *("no_exploration", "The agent does not explore", "exploration", "below", 0.005, "possible"),
         "How much of its actions is chance: the entropy or standard deviation of the policy, the action noise or ε, each as a "
         "share of the greatest possible. At the end of training it is wanted; before, nothing new is tried.",
-        f"SB3's and RL Zoo's settings: action noise of 0.1 or more, ε of 0.04 or more; for policies {OWN}",
+        f"RL Zoo's settings have an ε of 0.01 or more, half of which is the threshold, and action noise of 0.1 or more; for "
+        f"policies {OWN}",
         (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.ACTION_NOISE),
     ),
     Check(
@@ -133,7 +135,7 @@ CHECKS = (
         *("too_large_updates", "The updates change the policy too much", "policy_change", "above", 0.2, "likely"),
         "KL divergence of the policy before one iteration from that after it, on the rollout's observations, in nats. The "
         "data was collected by the policy before, and says little about one so different.",
-        "SB3's `target_kl` is usually 0.01 to 0.05",
+        "Spinning Up in Deep RL: target_kl is usually small, 0.01 or 0.05; four times the latter",
         (r.TARGET_KL, r.SMALLER_RATE, r.CCHAIN),
     ),
     Check(
@@ -263,18 +265,20 @@ def as_json(value: Any) -> Any:
     return value if math.isfinite(value) else None
 
 
-def findings_markdown() -> str:
+def findings_markdown(width: int = 120) -> str:
     """
-    :return: A table of all findings for the documentation
+    :param width: Length of its lines, but for those of the table
+    :return: All findings for the documentation: a table, and a list of what they mean
     """
-    rows = []
-    for check in CHECKS:
-        remedies = dict.fromkeys(remedy.title for remedy in check.remedies)
-        cells = [f"`{check.name}`", check.certainty, f"{check.title}. {check.meaning}"]
-        rows.append([*cells, check.healthy_range(), check.source, "; ".join(remedies)])
-    lines = [
-        ["finding", "certainty", "what it means", "healthy", "where the threshold comes from", "what to try"],
-        ["---"] * 6,
-        *rows,
+    header = [["finding", "what is wrong", "measure", "healthy", "certainty"], ["---"] * 5]
+    rows = [
+        [f"`{check.name}`", check.title, check.measure.replace("_", " "), check.healthy_range(), check.certainty]
+        for check in CHECKS
     ]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in [*header, *rows])
+    items = []
+    for check in CHECKS:
+        remedies = "; ".join(dict.fromkeys(remedy.title for remedy in check.remedies))
+        text = f"- `{check.name}`: {check.meaning} *Threshold*: {check.source}. *Try* {remedies}."
+        items.append(fill(text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False))
+    return "\n\n".join([table, "\n".join(items)])
