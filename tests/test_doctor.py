@@ -54,7 +54,7 @@ def make(algorithm, observations=VECTOR, actions=None, policy=None, env=None, **
     if issubclass(algorithm, OnPolicyAlgorithm):
         settings = {"n_steps": 64, **settings}
         if not issubclass(algorithm, A2C):
-            settings = {"batch_size": 32, **settings}
+            settings = {"batch_size": min(32, settings["n_steps"]), **settings}
         if lstm:
             settings["policy_kwargs"] = dict(NET, lstm_hidden_size=8)
     elif algorithm is ARS:
@@ -327,9 +327,9 @@ def test_the_lines_of_remedies_run(name):
     remedy = REMEDIES[name]
     for algorithm in remedy.algorithms:
         cls = BY_CLASS_NAME[algorithm]
-        model = make(cls, **(dict(n_steps=16, batch_size=16) if issubclass(cls, PPO) else {}))
+        model = make(cls, **(dict(n_steps=8) if issubclass(cls, OnPolicyAlgorithm) else {}))
         assert remedy.is_for(model) or not remedy.is_new(model)
-        given = {"env": model.env, "model": model, "total_timesteps": 20, algorithm: cls}
+        given = {"env": model.env, "model": model, "total_timesteps": 12, algorithm: cls}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of tiny batches
             exec(remedy.line_for(model), given)
@@ -375,7 +375,7 @@ def test_warns_once_of_each_finding():
     model, doctor = dead_units(), Doctor(interval=1)
 
     def learn():
-        model.learn(64 * 3, callback=doctor, log_interval=100)
+        model.learn(64 * 2, callback=doctor, log_interval=100)
         model.learn(64, callback=doctor, log_interval=100, reset_num_timesteps=False)
 
     messages = warned(learn)
@@ -410,7 +410,9 @@ def test_what_was_warned_of_is_known_after_resuming(checkpoint_last, tmp_path):
 
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_training_is_the_same_with_and_without(algorithm):
-    models = [make(algorithm).learn(80, callback=callback) for callback in (None, Doctor(interval=1))]
+    models = [
+        make(algorithm).learn(66 if algorithm is PPO else 20, callback=callback) for callback in (None, Doctor(interval=1))
+    ]
     for with_doctor, without in zip(*(model.policy.state_dict().values() for model in models), strict=True):
         assert th.equal(with_doctor, without)
 
