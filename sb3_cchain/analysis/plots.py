@@ -75,14 +75,15 @@ def plot_models(
     """
     matplotlib = import_matplotlib()
     with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
-        heights = [4.4 if ntks else 0.01, 1.2 + 0.3 * len(groups) * len(names)]
+        heights = [*([4.4] if ntks else []), 1.2 + 0.3 * len(groups) * len(names)]
         figure: Figure = matplotlib.figure.Figure(figsize=(11, sum(heights)), dpi=100, layout="constrained")
-        above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights).flat
-        for axes, ntk in zip(above.subplots(1, 2).flat, [*ntks, None, None][:2], strict=True):
-            if ntk is None:
-                axes.axis("off")
-            else:
-                above.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
+        *above, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
+        for part in above:
+            for axes, ntk in zip(part.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
+                if ntk is None:
+                    axes.axis("off")
+                else:
+                    part.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
         height = 0.8 / len(names)
         all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False).flat
         for axes, (title, values) in zip(all_axes, bars.items(), strict=True):
