@@ -1,0 +1,147 @@
+"""
+The table and the two pictures of the README, from the committed results of Gym Control. Trains nothing.
+
+    python -m benchmarks.run --suite gym_control --budget reduced --method cchain vanilla oracle --seeds 2   # makes the runs
+    python -m benchmarks.readme                                                                              # prints the table
+    python -m benchmarks.readme --write                                                     # table and pictures, into the README
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.grid.results import Result, read_results
+from benchmarks.grid.run import ROOT, short_name
+from benchmarks.grid.suites import SUITES
+from benchmarks.report.cells import Cell, Cells, make_cells
+from benchmarks.report.figures import smoothed
+from benchmarks.report.markdown import markdown_table
+from benchmarks.report.paper import read_tables
+from benchmarks.report.tables import method_label
+from benchmarks.speed.tables import write_tables
+from sb3_cchain.analysis.plots import import_matplotlib
+
+SUITE, BUDGET = "gym_control", "reduced"
+METHODS = ("oracle", "vanilla", "cchain")
+
+# The mean return of the last ten rollouts of a task, below which its policy has collapsed. The worst is -400 in Acrobot and 9.4
+# in CartPole; no task ends between the thresholds and far better returns (docs/results/gym_control.md). In MountainCar, a
+# policy that has not found the goal yet looks the same
+COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Continual/LunarLander-v3": -300}
+
+# The pictures: an environment where both seeds of PPO collapse
+PICTURED = "Continual/LunarLander-v3"
+PICTURES = {"vanilla": "docs/images/readme_ppo.png", "cchain": "docs/images/readme_cchain.png"}
+TITLES = {"vanilla": "PPO stops learning", "cchain": "C-CHAIN PPO goes on learning"}
+
+
+def read_cells(results: Path) -> Cells:
+    """
+    :param results: Folder of all results
+    :return: The runs of the README, by environment id and method
+    """
+    found, _ = read_results(results / BUDGET / SUITE)
+    cells, _ = make_cells([result for result in found if result.line in METHODS])
+    return cells
+
+
+def collapses(results: Sequence[Result]) -> tuple[int, int]:
+    """
+    :param results: Runs in environments of ``COLLAPSED``
+    :return: Tasks after a switch at whose end the policy has collapsed, and tasks after a switch
+    """
+    ends = [
+        result.returns_in_task(task)[1][-10:].mean() < COLLAPSED[result.env_id]
+        for result in results
+        for task in range(1, result.n_tasks)
+    ]
+    return sum(ends), len(ends)
+
+
+def readme_table(cells: Cells) -> str:
+    """
+    :param cells: The runs, by environment id and method
+    :return: J(T) in each environment, here and in the paper, and how many tasks end in a collapse
+    """
+    paper = read_tables()[SUITE]
+    rows = []
+    for env_id in SUITES[SUITE].env_ids:
+        here = [cells[env_id, method] for method in METHODS]
+        figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
+        lengths = f"{here[0].results[0].n_tasks} × {here[0].results[0].steps_per_task // 1000} 000"
+        seeds = ", ".join(sorted({" ".join(map(str, cell.seeds)) for cell in here}))
+        printed = [f"{figure.mean:.0f} ± {figure.standard_error:.0f}" for figure in figures]
+        rows.append([short_name(env_id), lengths, seeds, *map(_score, here), *printed])
+    labels = [method_label(SUITE, method) for method in METHODS]
+    header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
+    counts = {
+        method: collapses([result for env_id in COLLAPSED for result in cells[env_id, method].results])
+        for method in ("vanilla", "cchain")
+    }
+    (ppo, n_tasks), (cchain, _) = counts["vanilla"], counts["cchain"]
+    names = ", ".join(short_name(env_id).split("-")[0] for env_id in COLLAPSED)
+    sentence = f"{names}: of {n_tasks} tasks after a switch, PPO has collapsed at the end of {ppo}, C-CHAIN PPO of {cchain}."
+    return f"{markdown_table(header, rows)}\n\n{sentence}"
+
+
+def _score(cell: Cell) -> str:
+    return f"{cell.mean:.0f}" if cell.error is None else f"{cell.mean:.0f} ± {cell.error:.0f}"
+
+
+def plot(results: Sequence[Result], reference: float, limits: tuple[float, float], title: str, path: Path) -> None:
+    """
+    Draw the learning curves of a method, a line for each seed.
+
+    :param results: Its runs in one environment
+    :param reference: J(T) of the Oracle
+    :param limits: Of the returns
+    :param title: What the picture shows
+    :param path: PNG file
+    """
+    matplotlib = import_matplotlib()
+    figure = matplotlib.figure.Figure(figsize=(5.2, 3.6), layout="constrained")
+    panel = figure.subplots()
+    for index, result in enumerate(results):
+        for task in range(result.n_tasks):
+            steps, returns = result.returns_in_task(task)
+            panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=None if task else f"seed {result.seed}")
+    for end in results[0].task_boundaries[:-1]:
+        panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
+    panel.axhline(reference, color="black", linestyle=":", linewidth=1, label="fresh networks for each task, mean")
+    panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+    panel.set(ylim=limits, xlabel="environment steps; the world changes at the dashed lines", ylabel="return per episode")
+    panel.set_title(title, fontweight="bold")
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.legend(loc="lower left", fontsize="small", framealpha=1, edgecolor="white")
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    :param arguments: Arguments of the command line
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of all results")
+    parser.add_argument("--write", action="store_true", help="Put table and pictures into the README")
+    args = parser.parse_args(arguments)
+    cells = read_cells(args.results)
+    table = readme_table(cells)
+    print(table)
+    if args.write:
+        write_tables({"readme": table}, ROOT / "README.md")
+        curves = [
+            smoothed(result.returns_in_task(task)[1], 10)
+            for method in PICTURES
+            for result in cells[PICTURED, method].results
+            for task in range(result.n_tasks)
+        ]
+        every = np.concatenate(curves)
+        limits = (every.min() - 50, every.max() + 50)
+        for method, name in PICTURES.items():
+            plot(cells[PICTURED, method].results, cells[PICTURED, "oracle"].mean, limits, TITLES[method], ROOT / name)
+
+
+if __name__ == "__main__":
+    main()
