@@ -1,16 +1,14 @@
 """
-The table and the two pictures of the README, from the committed results of Gym Control. Trains nothing.
+The table and the picture of the README, from the committed results of Gym Control. Trains nothing.
 
     python -m benchmarks.run --suite gym_control --budget reduced --method cchain vanilla oracle --seeds 2   # makes the runs
-    python -m benchmarks.readme                                                                              # prints the table
-    python -m benchmarks.readme --write                                                     # table and pictures, into the README
+    python -m benchmarks.readme            # prints the table
+    python -m benchmarks.readme --write    # table and picture, into the README
 """
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from benchmarks.grid.results import Result, read_results
 from benchmarks.grid.run import ROOT, short_name
@@ -26,15 +24,14 @@ from sb3_cchain.analysis.plots import import_matplotlib
 SUITE, BUDGET = "gym_control", "reduced"
 METHODS = ("oracle", "vanilla", "cchain")
 
-# The mean return of the last ten rollouts of a task, below which its policy has collapsed. The worst is -400 in Acrobot and 9.4
-# in CartPole; no task ends between the thresholds and far better returns (docs/results/gym_control.md). In MountainCar, a
-# policy that has not found the goal yet looks the same
+# A policy has collapsed where the mean return of the last ten rollouts of a task is below this. Tasks end either far below or
+# far above (docs/results/gym_control.md). Not in MountainCar, where a policy that has not found the goal yet looks the same
 COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Continual/LunarLander-v3": -300}
 
-# The pictures: an environment where both seeds of PPO collapse
+# The picture: an environment where PPO collapses with both seeds
 PICTURED = "Continual/LunarLander-v3"
-PICTURES = {"vanilla": "docs/images/readme_ppo.png", "cchain": "docs/images/readme_cchain.png"}
-TITLES = {"vanilla": "PPO stops learning", "cchain": "C-CHAIN PPO goes on learning"}
+PICTURE = ROOT / "docs/images/loss_of_plasticity.png"
+TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: goes on learning"}
 
 
 def read_cells(results: Path) -> Cells:
@@ -90,31 +87,32 @@ def _score(cell: Cell) -> str:
     return f"{cell.mean:.0f}" if cell.error is None else f"{cell.mean:.0f} ± {cell.error:.0f}"
 
 
-def plot(results: Sequence[Result], reference: float, limits: tuple[float, float], title: str, path: Path) -> None:
+def plot(cells: Cells, path: Path) -> None:
     """
-    Draw the learning curves of a method, a line for each seed.
+    Draw the learning curves of PPO and of C-CHAIN PPO beside each other, a line for each seed.
 
-    :param results: Its runs in one environment
-    :param reference: J(T) of the Oracle
-    :param limits: Of the returns
-    :param title: What the picture shows
+    :param cells: The runs, by environment id and method
     :param path: PNG file
     """
     matplotlib = import_matplotlib()
-    figure = matplotlib.figure.Figure(figsize=(5.2, 3.6), layout="constrained")
-    panel = figure.subplots()
-    for index, result in enumerate(results):
-        for task in range(result.n_tasks):
-            steps, returns = result.returns_in_task(task)
-            panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=None if task else f"seed {result.seed}")
-    for end in results[0].task_boundaries[:-1]:
-        panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
-    panel.axhline(reference, color="black", linestyle=":", linewidth=1, label="fresh networks for each task, mean")
-    panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
-    panel.set(ylim=limits, xlabel="environment steps; the world changes at the dashed lines", ylabel="return per episode")
-    panel.set_title(title, fontweight="bold")
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.legend(loc="lower left", fontsize="small", framealpha=1, edgecolor="white")
+    figure = matplotlib.figure.Figure(figsize=(10, 3.8), layout="constrained")
+    panels = figure.subplots(1, len(TITLES), sharey=True)
+    for panel, (method, title) in zip(panels, TITLES.items(), strict=True):
+        results = cells[PICTURED, method].results
+        for index, result in enumerate(results):
+            for task in range(result.n_tasks):
+                steps, returns = result.returns_in_task(task)
+                label = None if task else f"seed {result.seed}"
+                panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=label)
+        for end in results[0].task_boundaries[:-1]:
+            panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
+        panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
+        panel.set_title(title, fontweight="bold")
+        panel.set_xlabel("environment steps; the world changes at the dashed lines")
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("return per episode")
+    panels[-1].legend(loc="lower right", framealpha=1, edgecolor="white")
     figure.savefig(path, dpi=120)
 
 
@@ -124,23 +122,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of all results")
-    parser.add_argument("--write", action="store_true", help="Put table and pictures into the README")
+    parser.add_argument("--write", action="store_true", help="Put table and picture into the README")
     args = parser.parse_args(arguments)
     cells = read_cells(args.results)
     table = readme_table(cells)
     print(table)
     if args.write:
         write_tables({"readme": table}, ROOT / "README.md")
-        curves = [
-            smoothed(result.returns_in_task(task)[1], 10)
-            for method in PICTURES
-            for result in cells[PICTURED, method].results
-            for task in range(result.n_tasks)
-        ]
-        every = np.concatenate(curves)
-        limits = (every.min() - 50, every.max() + 50)
-        for method, name in PICTURES.items():
-            plot(cells[PICTURED, method].results, cells[PICTURED, "oracle"].mean, limits, TITLES[method], ROOT / name)
+        plot(cells, PICTURE)
 
 
 if __name__ == "__main__":

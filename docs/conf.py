@@ -20,31 +20,31 @@ html_show_sphinx = False
 exclude_patterns = ["_build"]
 nitpicky = False
 
-# Captions of the sidebar, and the pages below them
+# Captions of the sidebar, and the pages below them, some with a shorter title
 CONTENTS = {
     "Get started": ["install", "quickstart", "faq"],
     "Guide": [
-        "changing_world",
+        "My world changes by itself <changing_world>",
         "environments",
         "which_method",
         "tuning",
         "diagnostics",
-        "modules/analysis",
         "modules/doctor",
+        "Monitors and inspection <modules/analysis>",
         "metrics",
         "callbacks",
         "resume",
         "zoo",
         "gpu",
-        "cluster",
+        "On a cluster: the paper's experiments <cluster>",
     ],
     "Methods": [
         "modules/ppo_cchain",
         "modules/dqn_cchain",
-        "modules/family",
+        "C-CHAIN for the other algorithms <modules/family>",
         "modules/optimizers",
         "modules/plasticity",
-        "modules/churn",
+        "Any training loop <modules/churn>",
     ],
     "Reference": [
         "reference/algorithms",
@@ -58,19 +58,20 @@ CONTENTS = {
         "reference/checkpoint",
     ],
     "Results": [
-        "results/gym_control",
-        "results/demo",
-        "results/plasticity",
-        "results/related",
-        "results/procgen",
-        "results/dm_control",
-        "results/minatar",
-        "results/family",
-        "results/*",
+        "Gym Control <results/gym_control>",
+        "The demo <results/demo>",
+        "Churn, NTK and networks <results/plasticity>",
+        "Related methods <results/related>",
+        "ProcGen <results/procgen>",
+        "DeepMind Control <results/dm_control>",
+        "MinAtar <results/minatar>",
+        "Other algorithms <results/family>",
+        "Reference batches <results/references>",
+        "Speed <results/speed>",
     ],
     "Project": ["comparison", "contributing", "changelog", "citing"],
 }
-# Pages that there may be
+# Pages that need not be there
 OPTIONAL = {"which_method", "modules/doctor"}
 
 
@@ -80,7 +81,7 @@ def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
         return
     for caption, pages in CONTENTS.items():
         there = [name for name in pages if name not in OPTIONAL or Path(app.srcdir, f"{name}.md").exists()]
-        source[0] += "\n".join(["", "```{toctree}", ":hidden:", ":glob:", f":caption: {caption}", "", *there, "```", ""])
+        source[0] += "\n".join(["", "```{toctree}", ":hidden:", f":caption: {caption}", "", *there, "```", ""])
 
 
 def setup(app: Sphinx) -> None:
