@@ -45,6 +45,7 @@ CONTENTS = {
         "modules/optimizers",
         "modules/plasticity",
         "Any training loop <modules/churn>",
+        "modules/*",
     ],
     "Reference": [
         "reference/algorithms",
@@ -72,7 +73,7 @@ CONTENTS = {
     "Project": ["comparison", "contributing", "changelog", "citing"],
 }
 # Pages that need not be there
-OPTIONAL = {"which_method", "modules/doctor"}
+OPTIONAL = {"which_method", "modules/doctor", "modules/*"}
 
 
 def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
@@ -80,8 +81,8 @@ def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
     if page != "index":
         return
     for caption, pages in CONTENTS.items():
-        there = [name for name in pages if name not in OPTIONAL or Path(app.srcdir, f"{name}.md").exists()]
-        source[0] += "\n".join(["", "```{toctree}", ":hidden:", f":caption: {caption}", "", *there, "```", ""])
+        there = [name for name in pages if name not in OPTIONAL or list(Path(app.srcdir).glob(f"{name}.md"))]
+        source[0] += "\n".join(["", "```{toctree}", ":hidden:", ":glob:", f":caption: {caption}", "", *there, "```", ""])
 
 
 def setup(app: Sphinx) -> None:
