@@ -45,7 +45,6 @@ CONTENTS = {
         "modules/optimizers",
         "modules/plasticity",
         "Any training loop <modules/churn>",
-        "modules/*",
     ],
     "Reference": [
         "reference/algorithms",
@@ -73,16 +72,24 @@ CONTENTS = {
     "Project": ["comparison", "contributing", "changelog", "citing"],
 }
 # Pages that need not be there
-OPTIONAL = {"which_method", "modules/doctor", "modules/*"}
+OPTIONAL = {"which_method", "modules/doctor"}
 
 
 def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
-    """Append the table of contents to the first page."""
+    """Append the table of contents to the first page; further pages on algorithms and methods stand last among them."""
     if page != "index":
         return
-    for caption, pages in CONTENTS.items():
-        there = [name for name in pages if name not in OPTIONAL or list(Path(app.srcdir).glob(f"{name}.md"))]
-        source[0] += "\n".join(["", "```{toctree}", ":hidden:", ":glob:", f":caption: {caption}", "", *there, "```", ""])
+    there = {path.relative_to(app.srcdir).with_suffix("").as_posix() for path in Path(app.srcdir).rglob("*.md")}
+    named = {page_of(entry) for entries in CONTENTS.values() for entry in entries}
+    others = sorted(name for name in there - named if name.startswith("modules/"))
+    for caption, entries in {**CONTENTS, "Methods": [*CONTENTS["Methods"], *others]}.items():
+        shown = [entry for entry in entries if page_of(entry) in there or page_of(entry) not in OPTIONAL]
+        source[0] += "\n".join(["", "```{toctree}", ":hidden:", f":caption: {caption}", "", *shown, "```", ""])
+
+
+def page_of(entry: str) -> str:
+    """The page of an entry, which may begin with a title."""
+    return entry.split("<")[-1].rstrip(">")
 
 
 def setup(app: Sphinx) -> None:
