@@ -216,6 +216,8 @@ def family_case(method):
     given = {**(ON_POLICY if issubclass(method.algorithm, OnPolicyAlgorithm) else OFF_POLICY), **CHURN, "churn_target": "auto"}
     if "policy" in churn_kind(method.algorithm).targets:
         given["churn_target"] = "both"
+    if not issubclass(method.algorithm, OnPolicyAlgorithm):
+        given["train_freq"] = 4  # SAC and its kin would update at each step
     allowed = constructor_arguments(method.algorithm)
     return Case(
         *(method.algorithm, env.get(name, PENDULUM), {key: value for key, value in given.items() if key in allowed}),

@@ -19,6 +19,7 @@ from rl_zoo3.train import train
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.tensorboard import layout
+from sb3_cchain.zoo import __main__ as console
 from sb3_cchain.zoo import cli
 
 ROOT = Path(__file__).parent.parent
@@ -178,7 +179,7 @@ def test_command_is_understood(command, monkeypatch):
         monkeypatch.setattr(cli, "find_resumed", lambda *options: options)  # it is not there
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(ParsedError):
-            cli.main()
+            console.main()
     else:
         monkeypatch.setattr(sys, "argv", command[2:])
         with pytest.raises(ParsedError):

@@ -1,5 +1,6 @@
 """Rollouts, advantages and value targets as in the paper's PPO."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
@@ -8,6 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain.callbacks import EpisodicRollouts
 from sb3_cchain.callbacks.episodic_rollouts import discounted_returns
+from sb3_cchain.envs import RewardScale
 from tests.envs import CountEnv
 
 
@@ -46,6 +48,22 @@ def test_rollouts(n_envs=2):
         assert np.allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-5)
         assert returns[:7, 0].tolist() == [7, 6, 5, 4, 3, 2, 1]
         assert np.allclose(np.diff(returns[7:, 0]), -1)  # and then the value of the last observation
+
+
+def test_the_score_counts_the_episode_that_the_rollout_cuts():
+    """Episodes of 7 steps with reward 1: 7, and 3 more steps in a rollout of 10; 7 and 7 in one of 14."""
+    for n_steps, expected in ((10, (7 + 3) / 2), (14, 7.0)):
+        model = PPO("MlpPolicy", CountEnv(), n_steps=n_steps, batch_size=2, normalize_advantage=False, device="cpu", seed=0)
+        model.learn(2 * n_steps, callback=EpisodicRollouts(), log_interval=100)
+        assert model.logger.name_to_value["continual/mean_return_with_cut"] == expected
+
+
+def test_the_score_is_of_rewards_before_any_scaling():
+    env = RewardScale(gym.make("Continual/CartPole-v1", n_tasks=2, steps_per_task=1000), scale=0.05)
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=32, normalize_advantage=False, device="cpu", seed=0)
+    model.learn(64, callback=EpisodicRollouts(), log_interval=100)
+    n_episodes = model.rollout_buffer.episode_starts.sum()
+    assert model.logger.name_to_value["continual/mean_return_with_cut"] == 64 / n_episodes
 
 
 def test_refuses_what_it_cannot_serve():

@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_cchain
-from sb3_cchain import CChainCallback, ChurnMonitor, TrainingCheckpoint, resume
+from sb3_cchain import CChainCallback, ChurnMonitor
 from sb3_cchain.algorithms.churn_targets import churn_kind
 from sb3_cchain.algorithms.reference_batches import PreviousRollout
 from tests.churn_models import DICT, IMAGE, NormalisedExtractor, assert_close, assert_equal, differ, go_on
@@ -336,27 +336,6 @@ def test_a_copy_has_reducers_of_its_own(member):
     assert other.churn_state.reducers is other.churn_reducers is not model.churn_reducers
     assert n_seen == [int(reducer.coefficient.n_seen) for reducer in model.churn_reducers.values()]
     assert min(int(reducer.coefficient.n_seen) for reducer in other.churn_reducers.values()) > 0
-
-
-@each
-def test_is_resumed_exactly(member, tmp_path):
-    def make():
-        return member.make(churn_target=member.targets[-1], **ADAPTIVE)
-
-    class Stop(BaseCallback):
-        last = 75
-
-        def _on_step(self):
-            return self.num_timesteps < self.last
-
-    # On-policy, a checkpoint waits until the log is written
-    whole = make().learn(96, log_interval=None)
-    make().learn(96, [TrainingCheckpoint(40, tmp_path / "checkpoints"), Stop()], log_interval=None)
-    (path,) = (tmp_path / "checkpoints").glob("step_*")
-    Stop.last = 1000
-    resumed = resume(path, member.make_env(), [TrainingCheckpoint(40, tmp_path / "further"), Stop()], device="cpu")
-    assert resumed.num_timesteps == whole.num_timesteps
-    assert_equal(whole, resumed)
 
 
 # --- Wherever the base runs ------------------------------------------------------------------------------------------------

@@ -800,7 +800,7 @@ def test_a_run_that_takes_no_time_has_a_rate(tmp_path, monkeypatch):
 @linux
 @pytest.mark.parametrize(
     "backend, ending",
-    [("local", "SIGKILL"), ("local", "SIGINT"), ("local", "SIGTERM"), ("ray", "SIGKILL"), ("ray", "SIGTERM")],
+    [("local", "SIGKILL"), ("local", "SIGINT"), ("ray", "SIGTERM")],
     indirect=["backend"],
 )
 def test_what_is_killed_goes_on(tmp_path, backend, ending, request):

@@ -11,7 +11,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_zip_file
 
-import sb3_cchain.zoo.cli
+import sb3_cchain.zoo.__main__
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.analysis import NetworkHealth
 from sb3_cchain.analysis.inspection import algorithm_of, inspect_model, report
@@ -32,7 +32,7 @@ OF_ALL |= {"churn_monitor/fresh/value_churn", "churn_monitor/fresh/greedy_action
 
 def inspect(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", "inspect", *map(str, arguments)])
-    sb3_cchain.zoo.cli.main()
+    sb3_cchain.zoo.__main__.main()
 
 
 @pytest.mark.parametrize("algorithm", list(ALGORITHMS))
@@ -137,7 +137,7 @@ def test_model_of_rl_zoo(tmp_path, monkeypatch):
         "sb3-cchain train --algo ppo --env Continual/CartPole-v1 --device cpu --seed 0 --eval-freq -1".split()
         + f"-conf {settings} -f {tmp_path} --env-kwargs n_tasks:2".split(),
     )
-    sb3_cchain.zoo.cli.main()
+    sb3_cchain.zoo.__main__.main()
     seen = []
     original = sb3_cchain.zoo.inspect.inspect_model
     monkeypatch.setattr(

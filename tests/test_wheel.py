@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import sb3_cchain
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -189,3 +191,11 @@ def test_holds_types_licence_and_all_hyperparameters(wheel):
     assert shipped == {path.name for path in (ROOT / "zoo_hyperparams").iterdir()}
     assert list(wheel.glob("sb3_cchain-*.dist-info/licenses/LICENSE"))
     assert not (wheel / "tests").exists() and not (wheel / "benchmarks").exists()
+
+
+def test_the_version_stands_once(wheel):
+    """In the package; pyproject.toml and the metadata of the wheel have it from there."""
+    (metadata,) = wheel.glob("sb3_cchain-*.dist-info")
+    assert metadata.name == f"sb3_cchain-{sb3_cchain.__version__}.dist-info"
+    assert f"version: {sb3_cchain.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"## {sb3_cchain.__version__}" in (ROOT / "CHANGELOG.md").read_text()

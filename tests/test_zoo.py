@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 import sb3_cchain.methods
 import sb3_cchain.zoo
+import sb3_cchain.zoo.__main__ as console
 import sb3_cchain.zoo.cli as zoo
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
@@ -360,4 +361,33 @@ def test_without_rl_zoo_one_line_names_the_mend(monkeypatch):
     with pytest.raises(ImportError, match=mend):
         import_module("sb3_cchain.zoo.cli")
     with pytest.raises(SystemExit, match="^sb3-cchain: The .*" + mend):
+        monkeypatch.setattr(sys, "argv", ["sb3-cchain", "train"])
         import_module("sb3_cchain.zoo.__main__").main()
+
+
+def test_help_and_version_need_no_rl_zoo(monkeypatch, capsys):
+    """They answer at once: RL Zoo is not imported."""
+    monkeypatch.setattr("builtins.__import__", refuse_rl_zoo(__import__))
+    for option in ("--help", "-h", "--version"):
+        monkeypatch.setattr(sys, "argv", ["sb3-cchain", option])
+        console.main()
+    output = capsys.readouterr().out
+    assert output.endswith(f"sb3-cchain {sb3_cchain.__version__}\n")
+    assert "search" in output and all(f"\n  {name} " in output for name in console.COMMANDS)
+
+
+def refuse_rl_zoo(import_):
+    def import_others(name, *args, **kwargs):
+        assert not name.startswith("rl_zoo3"), name
+        return import_(name, *args, **kwargs)
+
+    return import_others
+
+
+@pytest.mark.parametrize(
+    "arguments, message", [([], "^usage: sb3-cchain COMMAND"), (["tran"], "COMMAND must be one of .* got tran$")]
+)
+def test_what_is_no_command(monkeypatch, arguments, message):
+    monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
+    with pytest.raises(SystemExit, match=message):
+        console.main()

@@ -10,7 +10,7 @@ import rl_zoo3.exp_manager
 import rl_zoo3.train
 import yaml
 
-import sb3_cchain.zoo.cli as zoo
+import sb3_cchain.zoo.__main__ as zoo
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.zoo.settings import read_settings
 

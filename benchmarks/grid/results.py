@@ -29,7 +29,7 @@ from benchmarks.grid.run import Run, as_json, suite_methods
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 
-METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/")
+METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/", "continual/mean_return_with_cut")
 METRICS_COLUMNS = ("timesteps", "name", "value")
 
 # Names that classes had in the hyperparameters of older results

@@ -91,7 +91,7 @@ class Training:
             # As many threads as --num-threads, for the libraries that read the environment too
             variables = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}
             child = [sys.executable, str(Path(__file__).with_name("child.py")), str(os.getpid())]
-            program = program or (sys.executable, "-m", "sb3_cchain.zoo.cli")
+            program = program or (sys.executable, "-m", "sb3_cchain.zoo")
             # In a session of its own, so that Ctrl-C does not reach it: the parent tells it to stop, once
             self._process = subprocess.Popen(
                 [*child, *program, *arguments],

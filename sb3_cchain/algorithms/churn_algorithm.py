@@ -1,6 +1,6 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
@@ -18,6 +18,8 @@ from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
+
+SelfChurnAlgorithm = TypeVar("SelfChurnAlgorithm", bound="ChurnAlgorithm")
 
 
 class ChurnAlgorithm(ZeroRateWarning):
@@ -120,7 +122,7 @@ class ChurnAlgorithm(ZeroRateWarning):
         with reduced_churn(self, self.churn_reducers, self._churn_options()):
             super().train(*args, **kwargs)  # type: ignore[misc]
 
-    def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+    def learn(self: SelfChurnAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfChurnAlgorithm:
         """
         As the base algorithm's. In a continual environment the callbacks that follow its tasks are added.
 

@@ -15,14 +15,31 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
       ``normalize_advantage=False``;
     - the value function is fitted to the discounted return-to-go, while SB3 fits it to the TD(λ) return. The value of the
       last observation stands for the rest of an episode that was cut.
+
+    Logs ``continual/mean_return_with_cut``: the mean return of all episodes of the rollout, with the episode that the end of
+    the rollout cuts at its return so far. The released code scores Gym Control in this way. Returns are the environment's own,
+    before any scaling, where it tells them (a :class:`~sb3_cchain.ContinualEnv` does), else sums of the rewards learned from.
     """
 
     def _on_rollout_start(self) -> None:
         self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
         self.model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
+        self._returns: list[float] = []  # of the episodes that have ended
+        self._returns_so_far = [0.0] * self.training_env.num_envs
+
+    def _on_step(self) -> bool:
+        infos, rewards, dones = self.locals["infos"], self.locals["rewards"].tolist(), self.locals["dones"].tolist()
+        for index, (info, reward, done) in enumerate(zip(infos, rewards, dones, strict=True)):
+            self._returns_so_far[index] += info.get("task_reward", reward)
+            if done:
+                self._returns.append(self._returns_so_far[index])
+                self._returns_so_far[index] = 0.0
+        return True
 
     def _on_rollout_end(self) -> None:
         super()._on_rollout_end()
+        cut = [so_far for so_far, done in zip(self._returns_so_far, self.locals["dones"], strict=True) if not done]
+        self.logger.record("continual/mean_return_with_cut", float(np.mean([*self._returns, *cut])))
         buffer = self.model.rollout_buffer
         buffer.returns = discounted_returns(
             buffer.rewards,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # TensorBoard need not be installed
 # Category → title of the chart → regular expression of the tags in it, whole tags. One unit a chart.
 LAYOUT: dict[str, dict[str, str]] = {
     "Returns": {
-        "Mean return on the task being trained": "continual/mean_return",
+        "Mean return on the task being trained": "continual/mean_return(_with_cut)?",
         "Reward per step on the task being trained": "continual/reward_per_step",
         "Average return of each task": r"continual/average_task_\d+",
         "Average performance over the tasks so far": "continual/average_performance",

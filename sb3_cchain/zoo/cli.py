@@ -31,13 +31,10 @@ from sb3_cchain.zoo.experiment import ExperimentManager
 from sb3_cchain.zoo.search import register_search_spaces
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
 
-__all__ = ["hyperparams_folder", "main", "register_algorithms"]
+__all__ = ["hyperparams_folder", "register_algorithms", "run"]
 
-# RL Zoo's console script has these
-SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file")
-# and these are modules to run by `python -m rl_zoo3.NAME`
+# Modules of RL Zoo to run by `python -m rl_zoo3.NAME`; the other commands are of its console script
 MODULES = ("record_video", "record_training", "benchmark", "load_from_hub", "push_to_hub")
-COMMANDS = (*SCRIPTS[:2], "inspect", *SCRIPTS[2:], *MODULES)
 # They load a model to look at what it does
 PLAYING = ("enjoy", "record_video", "push_to_hub")
 
@@ -89,14 +86,12 @@ def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
     return subprocess.run(command, *args, **kwargs).returncode
 
 
-def main() -> None:
-    """Run the command that ``sys.argv`` names."""
-    if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
-        sys.exit(
-            f"usage: sb3-cchain {{{'|'.join(COMMANDS)}}} ...\n"
-            "All but inspect have the options of RL Zoo, and train more. Each lists them: sb3-cchain train --help"
-        )
-    command = sys.argv[1]
+def run(command: str) -> None:
+    """
+    Run a command with the arguments in ``sys.argv``.
+
+    :param command: Name of the command, which is also ``sys.argv[1]``
+    """
     register_algorithms(playing=command in PLAYING)
     # RL Zoo reads the files beside a model by a loader that runs what is in them
     with replaced(yaml, "UnsafeLoader", SettingsLoader):
@@ -170,7 +165,3 @@ def run_module(name: str) -> None:
         # enjoy has imported load_from_hub before
         warnings.filterwarnings("ignore", message=".*found in sys.modules", category=RuntimeWarning)
         runpy.run_module(f"rl_zoo3.{name}", run_name="__main__")
-
-
-if __name__ == "__main__":
-    main()
