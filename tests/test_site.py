@@ -98,24 +98,39 @@ def test_the_readme_shows_the_committed_results():
     assert readme_table(read_cells(ROOT / "benchmarks/results")) in shown, "run python -m benchmarks.readme --write"
 
 
-# Row of a table of the speed page, and the ratio to PPO that other pages state
+# Rows of the tables of the speed page, and the ratio to PPO that is stated elsewhere and in the page's first lines
+ITERATION, NEXT = "iteration (rollout and `train()`)", ', `churn_reference="next"`'
 RATIOS = [
-    ("gym_control", "iteration (rollout and `train()`)", "CChainPPO", "0.95"),
+    ("gym_control", ITERATION, "CChainPPO", "0.95"),
+    ("gym_control", ITERATION, f"CChainPPO{NEXT}", "0.88"),
+    ("gym_control", ITERATION, "deep copy", "1.55"),
+    ("gym_control", ITERATION, "SBX's PPO", "0.88"),
     ("gym_control", "`train()`", "CChainPPO", "1.26"),
+    ("gym_control", "`train()`", f"CChainPPO{NEXT}", "1.08"),
+    ("gym_control", "`train()`", "deep copy", "2.36"),
     ("gym_control", "`train()`", "SBX's PPO", "0.80"),
     ("dmc", "`train()`", "SBX's PPO", "0.60"),
     ("procgen", "`train()`", "CChainPPO", "2.30"),
-    ("procgen", "`train()`", 'CChainPPO, `churn_reference="next"`', "1.47"),
+    ("procgen", "`train()`", f"CChainPPO{NEXT}", "1.47"),
+    ("minatar", "`train()`", "CChainDQN", "1.33"),
+    ("minatar", "`train()`", f"CChainDQN{NEXT}", "1.16"),
 ]
 
 
 @pytest.mark.parametrize("table, what, model, ratio", RATIOS)
-def test_stated_costs_are_those_of_the_speed_page(table, what, model, ratio):
-    (row,) = re.findall(
-        rf"^\| {re.escape(what)} \| {re.escape(model)} \|(.*)$", tables(DOCS / "results/speed.md")[table], re.M
-    )
+def test_stated_costs_are_those_of_the_tables(table, what, model, ratio):
+    speed = DOCS / "results/speed.md"
+    (row,) = re.findall(rf"^\| {re.escape(what)} \| {re.escape(model)} \|(.*)$", tables(speed)[table], re.M)
     assert row.split("|")[1].split()[0] == ratio
-    assert any(ratio in (ROOT / page).read_text() for page in ("README.md", "docs/comparison.md"))
+    stated = [speed.read_text().split("How to read")[0], (DOCS / "comparison.md").read_text()]
+    assert any(ratio in text for text in stated)
+
+
+def test_the_readme_states_no_other_costs():
+    in_short = (DOCS / "results/speed.md").read_text().split("How to read")[0]
+    (cost,) = re.findall(r"^- \*\*Cost\.\*\*(.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    numbers = re.findall(r"\d+\.\d+", cost)
+    assert len(numbers) > 3 and set(numbers) <= set(re.findall(r"\d+\.\d+", in_short))
 
 
 def literal(node: ast.expr) -> str | None:
