@@ -5,6 +5,7 @@ import importlib
 import re
 import runpy
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -143,6 +144,7 @@ def literal(node: ast.expr) -> str | None:
     return None
 
 
+@cache
 def nodes() -> list[ast.AST]:
     return [node for path in (ROOT / "sb3_cchain").rglob("*.py") for node in ast.walk(ast.parse(path.read_text()))]
 
