@@ -26,14 +26,21 @@ OPTIMIZER_ARGUMENTS = {
     "WeightClipping": dict(clip_ratio=0.5),
     "L2Init": dict(coef=0.1, base_kwargs=dict(fused=True)),
     "Parseval": dict(coef=0.1),
+    "SpectralRegularization": dict(coef=0.1),
+    "UPGD": dict(sigma=0.1),
 }
 CALLBACK_ARGUMENTS = {
+    "ContinualBackprop": dict(replacement_rate=0.1, maturity_threshold=2),
     "ReDo": dict(tau=0.3, interval=1),
+    "ReGraMa": dict(tau=0.5, interval=1),
+    "SelfNormalizedResets": dict(max_threshold=2, update_interval=2, interval=1),
+    "FIRE": dict(interval=16),
     "LayerReset": dict(n_layers=1, interval=16),
     "PlasticityInjection": dict(timestep=16),
     "ShrinkAndPerturb": dict(shrink=0.999, interval=2),
 }
-OPTIMIZERS = {method.name: method for method in REGISTRY if method.optimizer_class is not None}
+# Those that go around others. tests/test_kron.py tests the other one
+OPTIMIZERS = {m.name: m for m in REGISTRY if m.optimizer_class is not None and m.optimizer_class.has_arguments_of_base}
 CALLBACKS = list(dict.fromkeys(cls for m in REGISTRY if m.optimizer_class is None for cls in m.callbacks))
 
 
@@ -88,7 +95,7 @@ def make_callback(cls):
 
 def make_method(method, with_c_chain=False):
     """The model and the callbacks of a row of the registry, with C-CHAIN in place of its algorithm if wanted."""
-    policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
+    policy_kwargs = {**method.policy_kwargs, "net_arch": [8]}
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
     algorithm = method.algorithm

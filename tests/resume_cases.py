@@ -194,7 +194,7 @@ def correlated_noise(env):
 
 
 def method_case(method):
-    policy_kwargs = dict(NET, **method.policy_kwargs)
+    policy_kwargs = {**method.policy_kwargs, **NET}
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
     on_policy = issubclass(method.algorithm, PPO)

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from sb3_cchain.analysis.metrics.dormancy import mean_activity
 from sb3_cchain.methods.hidden_units import find_hidden_units, hidden_activity
-from sb3_cchain.networks import CReLU
+from sb3_cchain.networks import CReLU, FourierFeatures
 from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 
 
@@ -91,8 +91,9 @@ def test_layer_norms_between():
     assert layers["0.linear.2"].norms["0.linear.3"].tolist() == list(range(5))
 
 
-def test_concatenated_relu():
-    layers = find(nn.Sequential(nn.Linear(2, 3), CReLU(), nn.Linear(6, 2)), 2)
+@pytest.mark.parametrize("activation", [CReLU, FourierFeatures])
+def test_activations_that_double_the_width(activation):
+    layers = find(nn.Sequential(nn.Linear(2, 3), activation(), nn.Linear(6, 2)), 2)
     assert layers["0"].outgoing["2"].tolist() == [0, 1, 2, 0, 1, 2]
 
 

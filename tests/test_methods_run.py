@@ -33,6 +33,10 @@ ALL_KEYS = {
     "l2_init/distance",
     "parseval/loss",
     "normalize_and_project/norm",
+    "spectral_regularization/loss",
+    "ewc/loss",
+    "upgd/greatest_utility",
+    "muon/share",
 }
 
 

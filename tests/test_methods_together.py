@@ -1,12 +1,17 @@
-"""All methods that are callbacks and networks at once, with each algorithm; and all methods with C-CHAIN."""
+"""All methods in pairs; those that are callbacks and networks at once, with each algorithm; and all methods with C-CHAIN."""
+
+import re
+from functools import partial
 
 import pytest
 import torch as th
-from stable_baselines3 import DQN
+from stable_baselines3 import DQN, PPO
 
-from sb3_cchain import TaskSync
-from sb3_cchain.methods import AdamRel, OptimizerMetrics, Oracle, PlasticityInjection, ReDo, ShrinkAndPerturb
+from sb3_cchain import ContinualEnv, TaskSync
+from sb3_cchain.methods import AdamRel, EWCConsolidation, OptimizerMetrics, Oracle, PlasticityInjection, ReDo, ShrinkAndPerturb
+from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.networks import LayerNormDQNPolicy, LayerNormPolicy
+from tests.envs import CountEnv
 from tests.method_models import (
     ALGORITHMS,
     CALLBACKS,
@@ -18,13 +23,96 @@ from tests.method_models import (
     make_model,
     make_random_env,
     nested_optimizers,
+    optimizer_arguments,
     parameters,
 )
 
+PPO_METHODS = [method for method in REGISTRY if method.is_related and issubclass(method.algorithm, PPO)]
 
-# AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own
+# Two methods that do not go together, and how training says so
+REFUSED = {
+    ("layer_reset", "plasticity_injection"): "LayerReset does not know heads for plasticity injection, got InjectionPolicy",
+    ("plasticity_injection", "redo"): "ReDo does not know heads for plasticity injection, got InjectionPolicy",
+    ("plasticity_injection", "regrama"): "ReGraMa does not know heads for plasticity injection, got InjectionPolicy",
+    ("plasticity_injection", "self_normalized_resets"): "SelfNormalizedResets does not know heads for plasticity injection",
+    ("continual_backprop", "plasticity_injection"): "ContinualBackprop does not know heads for plasticity injection",
+    ("crelu", "plasticity_injection"): "`activation_fn` must keep the number of features for InjectionPolicy, got CReLU",
+    (
+        "fourier",
+        "plasticity_injection",
+    ): "`activation_fn` must keep the number of features for InjectionPolicy, got FourierFeat",
+}
+
+
+def compose(one, other, algorithm="PPO"):
+    """A model and callbacks with two methods: the optimiser of the first around that of the second."""
+    methods = (one, other)
+    policy_kwargs = {"net_arch": [8], **one.policy_kwargs, **other.policy_kwargs}
+    # An activation goes into any policy, and a policy that the optimiser's row recommends gives way
+    policies = sorted(
+        (method for method in methods if method.policy != "MlpPolicy"),
+        key=lambda method: (bool(method.callbacks) and method.optimizer_class is None, not method.policy_kwargs),
+    )
+    for method in reversed([method for method in methods if method.optimizer_class is not None]):
+        kwargs = optimizer_arguments(method)
+        if "optimizer_class" in policy_kwargs:
+            inside = (policy_kwargs["optimizer_class"], policy_kwargs["optimizer_kwargs"])
+            kwargs.update(base_class=inside[0], base_kwargs=inside[1])
+        policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=kwargs)
+    model = make_model(
+        *(algorithm, ContinualEnv([partial(CountEnv, name=task) for task in range(3)], steps_per_task=16)),
+        *(policies[-1].policy if policies else "MlpPolicy",),
+        **dict(policy_kwargs=policy_kwargs, n_steps=8, n_epochs=1),
+    )
+    return model, [make_callback(cls) for cls in dict.fromkeys([*one.callbacks, *other.callbacks])]
+
+
+def goes_into(one, other):
+    """Whether a model can have the networks of both."""
+    structures = {m.policy for m in (one, other) if m.policy != "MlpPolicy" and m.optimizer_class is None}
+    activations = [method for method in (one, other) if "activation_fn" in method.policy_kwargs]
+    return len(structures) < 2 or len(activations) == 1
+
+
+@pytest.mark.parametrize("number", range(len(PPO_METHODS)), ids=lambda number: PPO_METHODS[number].name)
+def test_each_pair_trains_or_is_refused(number):
+    """The method with each of those behind it, and with the next one in C-CHAIN."""
+    one, behind = PPO_METHODS[number], PPO_METHODS[number + 1 :]
+    pairs = [(other, "PPO") for other in behind if goes_into(one, other)]
+    pairs += [(other, "CChainPPO") for other, _ in pairs[:1]]
+    for other, algorithm in pairs:
+        names = tuple(sorted((one.name, other.name)))
+        if names in REFUSED:
+            with pytest.raises((TypeError, ValueError), match=re.escape(REFUSED[names])):
+                model, callbacks = compose(one, other, algorithm)
+                model.learn(8, callback=[TaskSync(), *callbacks])
+            continue
+        try:
+            model, callbacks = compose(one, other, algorithm)
+            before = parameters(model)
+            model.learn(32, callback=[TaskSync(), *callbacks], log_interval=1000)
+        except Exception as error:
+            pytest.fail(f"{names} neither go together in {algorithm} nor are they in REFUSED: {error!r}")
+        held = {id(p) for group in model.policy.optimizer.param_groups for p in group["params"]}
+        assert {id(p) for p in model.policy.parameters() if p.requires_grad} <= held, names
+        after = parameters(model)
+        assert all(tensor.isfinite().all() for tensor in after.values()), names
+        changed = any(not th.equal(tensor, before[name]) for name, tensor in after.items())
+        assert changed or "trac" in names, names  # whose scale may have fallen to 0
+
+
+def test_refused_pairs_are_of_the_registry():
+    names = {method.name for method in PPO_METHODS}
+    assert all(set(pair) <= names and tuple(sorted(pair)) == pair for pair in REFUSED)
+
+
+# AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own,
+# EWCConsolidation an optimiser
 def callbacks():
-    return [TaskSync(), *(make_callback(cls) for cls in CALLBACKS if cls not in (AdamRel, PlasticityInjection))]
+    return [
+        TaskSync(),
+        *(make_callback(cls) for cls in CALLBACKS if cls not in (AdamRel, PlasticityInjection, EWCConsolidation)),
+    ]
 
 
 def find(cls, callbacks):
@@ -72,7 +160,7 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
     def callbacks():
         redo = ReDo(tau=0.5, interval=4 if "DQN" in name else 1)  # updates, rollouts
         # The environment is not continual, so Oracle has nothing to do
-        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle, PlasticityInjection)]
+        others = [make_callback(cls) for cls in CALLBACKS if cls not in (ReDo, Oracle, PlasticityInjection, EWCConsolidation)]
         return [redo, *others, OptimizerMetrics()] if everything else [redo]
 
     layer_norm = LayerNormDQNPolicy if "DQN" in name else LayerNormPolicy
@@ -104,7 +192,7 @@ def test_with_c_chain_goes_on_as_if_never_stopped(tmp_path, name, everything):
     # TRAC's scale may have fallen to 0, the moments are of the gradients all the same
     moments, moments_after_loading = (m.policy.optimizer.state_dict()["state"] for m in (model, loaded))
     for parameter in range(len(model.policy.optimizer.param_groups[0]["params"])):
-        assert moments[parameter]["exp_avg"].any()
+        assert moments[parameter]["momentum_buffer" if "momentum_buffer" in moments[parameter] else "exp_avg"].any()
         assert all(th.equal(value, moments_after_loading[parameter][key]) for key, value in moments[parameter].items())
 
 

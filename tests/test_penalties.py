@@ -2,11 +2,14 @@
 
 import pytest
 import torch as th
+from gymnasium.spaces import Box, Discrete
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 from torch import nn
 
 from sb3_cchain.methods import L2Init, Parseval
+from sb3_cchain.networks import LayerNormPolicy
+from tests.envs import RandomEnv
 from tests.sb3_source import rewritten
 
 COEF = 0.3
@@ -90,6 +93,33 @@ def test_gradients_are_autograds(kind):
         else:
             assert th.allclose(parameter.grad, expected, rtol=1e-12, atol=0)
     assert optimizer.metrics()[f"{cls.name}/loss"] == pytest.approx(loss.item(), rel=1e-12)
+
+
+def test_l2_init_without_normalisations_by_hand():
+    """log_std, a layer of 1 unit with a LayerNorm, and an output layer, all of one entry, which moves by 2."""
+    shapes = [(1,), (1, 1), (1,), (1,), (1,), (1, 1), (1,)]
+    for reduction, loss in (("sum", 0.5 * 5 * 4), ("mean", 0.5 * 4)):
+        parameters = [th.nn.Parameter(th.zeros(shape)) for shape in shapes]
+        optimizer = L2Init(parameters, lr=1.0, coef=0.5, reduction=reduction, exclude_norms=True)
+        optimizer.reference()
+        with th.no_grad():
+            for parameter in parameters:
+                parameter += 2
+        assert optimizer.metrics() == {"l2_init/loss": loss, "l2_init/distance": pytest.approx(20**0.5)}
+        optimizer.zero_grad()
+        gradient = 2 * 0.5 * 2 / (5 if reduction == "mean" else 1)
+        found = [None if p.grad is None else p.grad.item() for p in parameters]
+        assert found == [pytest.approx(gradient)] * 3 + [None, None] + [pytest.approx(gradient)] * 2
+
+
+def test_l2_init_leaves_out_the_norms_of_a_policy():
+    for policy, action_space in ((LayerNormPolicy, Discrete(2)), (LayerNormPolicy, Box(-1, 1, (2,)))):
+        kwargs = dict(optimizer_class=L2Init, optimizer_kwargs=dict(exclude_norms=True), net_arch=[8, 8])
+        model = PPO(policy, RandomEnv(action_space=action_space), policy_kwargs=kwargs, device="cpu")
+        norms = {id(p) for m in model.policy.modules() if isinstance(m, nn.LayerNorm) for p in m.parameters()}
+        optimizer = model.policy.optimizer
+        assert len(norms) == 8
+        assert {id(p) for p in optimizer.parameters()} - {id(p) for p in optimizer._penalised()} == norms
 
 
 def test_l2_init_by_hand():

@@ -11,7 +11,7 @@ from sb3_cchain import TaskSync
 from sb3_cchain.methods import Oracle, PlasticityInjection
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.plasticity_injection import inject
-from sb3_cchain.networks import InjectionDQNPolicy, InjectionPolicy
+from sb3_cchain.networks import CReLU, InjectionDQNPolicy, InjectionPolicy
 from sb3_cchain.networks.injection_policies import InjectableHidden, InjectableOutput
 from tests.envs import CountEnv
 from tests.method_models import ALGORITHMS, STEPS_PER_TASK, go_on, make_env, make_model, make_random_env, parameters
@@ -165,3 +165,6 @@ def test_what_it_refuses():
         make("PPO", env=CountEnv()).learn(10, callback=PlasticityInjection())
     with pytest.raises(ValueError, match="`use_sde` must be False"):
         PPO(InjectionPolicy, "Pendulum-v1", use_sde=True, device="cpu")
+    for name, policy in (("PPO", InjectionPolicy), ("DQN", InjectionDQNPolicy)):
+        with pytest.raises(ValueError, match=f"`activation_fn` must keep .* for {policy.__name__}, got CReLU"):
+            make_model(name, policy=policy, policy_kwargs=dict(activation_fn=CReLU))

@@ -13,7 +13,7 @@ from torch import nn
 from sb3_cchain import CChainCallback
 from sb3_cchain.methods import L2Init, ReDo, WeightClipping
 from sb3_cchain.methods.hidden_units import find_hidden_units
-from sb3_cchain.methods.redo import recycle_units
+from sb3_cchain.methods.unit_recycling import recycle_units
 from sb3_cchain.networks import LayerNormPolicy
 from sb3_cchain.networks.extractors import MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
@@ -374,3 +374,64 @@ def test_of_a_layer_norm_network():
     redo.init_callback(model)
     model.learn(16, callback=redo)
     assert norm.bias[3] > -1
+
+
+@pytest.mark.parametrize(
+    "policy, policy_kwargs, space",
+    [
+        ("CnnPolicy", dict(features_extractor_kwargs=dict(features_dim=8), net_arch=[]), FRAMES),
+        (ImpalaPolicy, dict(features_extractor_kwargs=dict(features_dim=8, channels=(2, 4))), IMAGES),
+    ],
+)
+def test_the_flattened_layer_is_scored_on_request(policy, policy_kwargs, space):
+    """Inputs of the linear layer that are never active: their outgoing weights become 0, with the moments."""
+    model = PPO(
+        policy, RandomEnv(space), n_steps=8, batch_size=8, n_epochs=1, seed=0, device="cpu", policy_kwargs=policy_kwargs
+    )
+    name = "features_extractor.linear.1" if policy is ImpalaPolicy else "features_extractor.linear.0"
+    linear = model.policy.get_submodule(name)
+    inputs = []
+    linear.register_forward_hook(lambda module, given, output: inputs.append(given[0]))
+    before, redo = parameters(model), ReDo(tau=0.0, interval=1, batch_size=8, score_flattened=True)
+    learning = model.lr_schedule
+    model.lr_schedule = lambda _: 0.0
+    model.learn(8, callback=redo)
+    assert redo._layers[-1].layer == f"{name}.inputs" and not redo._layers[-1].has_weights
+    silent = (inputs[-1] == 0).all(dim=0)
+    after = parameters(model)
+    # Of the units of the layer before, and of the flattened one
+    zeroed = (after[f"{name}.weight"] == 0).all(dim=0)
+    assert silent.any() and not silent.all() and (zeroed[silent]).all() and not zeroed[~silent].any()
+    assert (
+        th.equal(after[f"{name}.weight"][:, ~zeroed], before[f"{name}.weight"][:, ~zeroed]) or redo.n_recycled > silent.sum()
+    )
+    assert not model.policy.optimizer.state[linear.weight]["exp_avg"][:, silent].any()
+    assert model.logger.name_to_value[f"redo/dormant_share/{name}.inputs"] == pytest.approx(silent.float().mean().item())
+    model.lr_schedule = learning
+    model.learn(8, callback=redo, reset_num_timesteps=False)
+
+
+def test_a_network_without_convolutions_has_no_flattened_layer():
+    redo = ReDo(score_flattened=True)
+    make_model("PPO", env=make_random_env()).learn(16, callback=redo)
+    assert all(layer.has_weights for layer in redo._layers)
+
+
+@pytest.mark.parametrize("reset_steps", [False, True])
+def test_step_counts(reset_steps):
+    network, fresh, inputs = make_network(), make_network(), th.randn(8, 2)
+    optimizer = one_adam_step(network, inputs)
+    first, _ = find_hidden_units(network.eval(), lambda: network(th.zeros(1, 2)))
+    recycle_units(first, th.tensor([False, True, False, False]), network, fresh, optimizer, reset_steps)
+    steps = {name: int(optimizer.state[parameter]["step"]) for name, parameter in network.named_parameters()}
+    concerned = {"0.weight", "0.bias", "2.weight"} if reset_steps else set()
+    assert steps == {name: int(name not in concerned) for name in steps}
+
+
+def test_the_option_reaches_the_optimiser():
+    for reset_steps, step in ((False, 4), (True, 0)):
+        model = make_model("PPO", env=make_random_env())
+        model.learn(16, callback=ReDo(tau=0.9, interval=1, reset_steps=reset_steps))
+        parameter = model.policy.mlp_extractor.policy_net[0].weight
+        assert model.policy.optimizer.state[parameter]["step"] == step
+        assert model.policy.optimizer.state[model.policy.value_net.bias]["step"] == 4

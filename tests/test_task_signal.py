@@ -17,7 +17,9 @@ from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods import (
+    EWC,
     EntropyBonusRestart,
+    EWCConsolidation,
     ExplorationRateRestart,
     LayerReset,
     LogStdRestart,
@@ -147,10 +149,11 @@ def count_calls(owner, name):
     return calls
 
 
-def boundary(make, ppo_policy="MlpPolicy"):
+def boundary(make, ppo_policy="MlpPolicy", **policy_kwargs):
     def listener(algorithm):
         callback = make()
-        return make_model(algorithm, World(), policy=ppo_policy), [callback], count_calls(callback, "_on_task_switch")
+        model = make_model(algorithm, World(), policy=ppo_policy, policy_kwargs=dict(net_arch=[8], **policy_kwargs))
+        return model, [callback], count_calls(callback, "_on_task_switch")
 
     return listener
 
@@ -202,6 +205,7 @@ LISTENERS = {
     "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
     "LayerReset": boundary(LayerReset),
     "PlasticityInjection": boundary(PlasticityInjection, InjectionPolicy),
+    "EWCConsolidation": boundary(EWCConsolidation, optimizer_class=EWC),
     "ExplorationRateRestart": boundary(ExplorationRateRestart),
     "EntropyBonusRestart": boundary(EntropyBonusRestart),
     "LogStdRestart": gaussian,
@@ -240,7 +244,7 @@ def test_every_boundary_is_a_listener_here():
 
 @pytest.mark.parametrize("method", [m for m in REGISTRY if m.page != FAMILY_PAGE], ids=lambda method: method.algo)
 def test_every_method_trains_with_a_signal(method):
-    policy_kwargs = dict(net_arch=[8], **method.policy_kwargs)
+    policy_kwargs = {**method.policy_kwargs, "net_arch": [8]}
     if method.optimizer_class is not None:
         policy_kwargs.update(optimizer_class=method.optimizer_class, optimizer_kwargs=optimizer_arguments(method))
     model = make_model(method.algorithm.__name__, World(), policy=method.policy, policy_kwargs=policy_kwargs)

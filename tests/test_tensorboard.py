@@ -127,6 +127,8 @@ def logged_by_methods():
 METHOD_TAGS = {"trac/scale", "l2_init/distance", "l2_init/loss", "parseval/loss", "weight_clipping/share", "redo/n_recycled"}
 METHOD_TAGS |= {"redo/dormant_share", "oracle/n_resets", "adam_rel/n_resets", "shrink_and_perturb/n_steps"}
 METHOD_TAGS |= {"layer_reset/n_resets", "plasticity_injection/is_injected", "normalize_and_project/norm"}
+METHOD_TAGS |= {"continual_backprop/n_recycled", "regrama/n_recycled", "self_normalized_resets/n_recycled", "fire/n_resets"}
+METHOD_TAGS |= {"spectral_regularization/loss", "ewc/loss", "ewc/n_tasks", "upgd/greatest_utility", "muon/share"}
 
 
 def test_each_tag_of_a_method_has_one_chart():

@@ -21,11 +21,14 @@ from benchmarks.speed.settings import model_settings
 from benchmarks.speed.timing import Case, Entry, Product, n_operations, seconds
 from benchmarks.speed.training import iteration, timed_learn
 from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync, make_lean
-from sb3_cchain.methods import ReDo
+from sb3_cchain.methods import ReDo, ReGraMa
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 
 # Methods that by default act less often than once in what is timed, so that they would seem to cost nothing
-EACH_ITERATION: dict[type[BaseCallback], dict[str, Any]] = {ReDo: {"interval": 1}}
+EACH_ITERATION: dict[type[BaseCallback], dict[str, Any]] = {
+    ReDo: {"interval": 1},
+    ReGraMa: {"interval": 1},
+}
 
 
 def ppo(env_id: str, product: Callable[[], Product], n_rounds: int, sbx: bool = True, **changed: Any) -> Case:
@@ -92,7 +95,8 @@ def related() -> Case:
         adam = settings["policy_kwargs"].pop("optimizer_kwargs")
         policy_kwargs = {"optimizer_kwargs": adam, **settings["policy_kwargs"], **method.policy_kwargs}
         if method.optimizer_class is not None:
-            optimizer_kwargs = {"base_kwargs": adam, **method.optimizer_kwargs}
+            base = {"base_kwargs": adam} if method.optimizer_class.has_arguments_of_base else {}
+            optimizer_kwargs = {**base, **method.optimizer_kwargs}
             policy_kwargs |= {"optimizer_class": method.optimizer_class, "optimizer_kwargs": optimizer_kwargs}
         model = method.algorithm(**{**settings, "policy": method.policy, "policy_kwargs": policy_kwargs})
         # Each with the callbacks that it learns with

@@ -1,5 +1,6 @@
 """Adam with relative timesteps."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch as th
@@ -69,15 +70,17 @@ class AdamRel(BaseCallback):
         self.logger.record("adam_rel/n_resets", self.n_resets)
 
 
-def reset_step_count(optimizer: th.optim.Optimizer) -> bool:
+def reset_step_count(optimizer: th.optim.Optimizer, parameters: Iterable[th.Tensor] | None = None) -> bool:
     """
     Set Adam's step count to 0.
 
     :param optimizer: An optimiser
+    :param parameters: Those whose step count it is; None for all
     :return: Whether there was something to set, which is so from its first update on
     :raises TypeError: When it has made an update and does not count updates
     """
-    states = [state for key, state in optimizer.state.items() if th.is_tensor(key)]
+    keys = [key for key in optimizer.state if th.is_tensor(key)] if parameters is None else parameters
+    states = [optimizer.state[key] for key in keys if key in optimizer.state]
     for state in states:
         if "step" not in state:
             raise TypeError(_NO_STEP_COUNT.format(type(optimizer).__name__))

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch as th
 from torch import nn
 
 from sb3_cchain.analysis.metrics.dormancy import mean_activity
-from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU
+from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU, FourierFeatures
 from sb3_cchain.networks.forward_hooks import forward_hooks
 
 
@@ -24,12 +25,14 @@ class HiddenUnits:
     :param n_units: Number of units
     :param outgoing: The layers that the units feed, with their sources
     :param norms: The LayerNorms between, with the sources of their parameters
+    :param has_weights: Whether ``layer`` is a module, of which each unit has incoming weights of its own
     """
 
     layer: str
     n_units: int
     outgoing: dict[str, th.Tensor]
     norms: dict[str, th.Tensor]
+    has_weights: bool = True
 
 
 def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
@@ -62,7 +65,7 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
             arrived[module] = _channels_last(module, inputs[0])
             tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
             return tagged.clone()  # for activations that write into their inputs
-        if isinstance(module, CReLU):
+        if isinstance(module, (CReLU, FourierFeatures)):
             return th.cat([inputs[0], inputs[0]], dim=1)
         if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
             arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
@@ -93,30 +96,77 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
     return found
 
 
-def hidden_activity(network: nn.Module, layers: list[HiddenUnits], run: Callable[[], Any]) -> list[th.Tensor]:
+def find_flattened_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
+    """
+    :param network: The network, in evaluation mode
+    :param run: Calls it on a batch of one observation of zeros
+    :return: For each linear layer that follows a convolution, its inputs as the units of a layer without weights of its own,
+        called ``<linear layer>.inputs``
+    """
+    names = {module: name for name, module in network.named_modules() if _is_layer(module)}
+    order: list[nn.Module] = []
+    with forward_hooks(names, lambda module, inputs, output: order.append(module)), th.no_grad():
+        run()
+    found = {}
+    for before, layer in pairwise(order):
+        if isinstance(layer, nn.Linear) and not isinstance(before, nn.Linear):
+            source = th.arange(layer.in_features, device=layer.weight.device)
+            found[layer] = HiddenUnits(f"{names[layer]}.inputs", layer.in_features, {names[layer]: source}, {}, False)
+    return list(found.values())
+
+
+def received_activity(
+    network: nn.Module,
+    layers: list[HiddenUnits],
+    run: Callable[[], Any],
+    measure: Callable[[th.Tensor], th.Tensor] = mean_activity,
+) -> dict[str, th.Tensor]:
     """
     :param network: The network
     :param layers: Its hidden units
     :param run: Calls it on a batch of observations
-    :return: For each layer, :func:`~sb3_cchain.analysis.metrics.dormancy.mean_activity` of its units ``(n_units,)``, as the
-        next layers receive them
+    :param measure: Of the activations ``(batch and positions, channels)``, to ``(channels,)``
+    :return: For each layer that is fed by the units, the measure of its input channels
     """
     modules = {network.get_submodule(name): name for layer in layers for name in layer.outgoing}
     activity: dict[str, th.Tensor] = {}
 
-    def measure(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
-        activity[modules[module]] = mean_activity(_channels_last(module, inputs[0]))
+    def look(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> None:
+        activity[modules[module]] = measure(_channels_last(module, inputs[0]))
 
-    with forward_hooks(modules, measure), th.no_grad():
+    with forward_hooks(modules, look), th.no_grad():
         run()
+    return activity
 
-    layer_activity = []
-    for layer in layers:
-        received = th.cat([activity[name][source >= 0] for name, source in layer.outgoing.items()])
-        units = th.cat([source[source >= 0] for source in layer.outgoing.values()])
-        total = received.new_zeros(layer.n_units).index_add(0, units, received)
-        layer_activity.append(total / units.bincount(minlength=layer.n_units))
-    return layer_activity
+
+def sum_of_places(layer: HiddenUnits, values: dict[str, th.Tensor]) -> th.Tensor:
+    """
+    :param layer: A hidden layer
+    :param values: For each layer that it feeds, a value of each input channel
+    :return: For each unit the sum over the channels that it is, ``(n_units,)``
+    """
+    received = th.cat([values[name][source >= 0] for name, source in layer.outgoing.items()])
+    units = th.cat([source[source >= 0] for source in layer.outgoing.values()])
+    return received.new_zeros(layer.n_units).index_add(0, units, received)
+
+
+def hidden_activity(
+    network: nn.Module,
+    layers: list[HiddenUnits],
+    run: Callable[[], Any],
+    measure: Callable[[th.Tensor], th.Tensor] = mean_activity,
+) -> list[th.Tensor]:
+    """
+    :param network: The network
+    :param layers: Its hidden units
+    :param run: Calls it on a batch of observations
+    :param measure: As for :func:`received_activity`
+    :return: For each layer, the measure of its units ``(n_units,)``, by default
+        :func:`~sb3_cchain.analysis.metrics.dormancy.mean_activity`, as the next layers receive them
+    """
+    activity = received_activity(network, layers, run, measure)
+    ones = {name: th.ones_like(value) for name, value in activity.items()}
+    return [sum_of_places(layer, activity) / sum_of_places(layer, ones) for layer in layers]
 
 
 def _is_layer(module: nn.Module) -> bool:

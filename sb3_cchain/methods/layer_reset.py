@@ -5,11 +5,10 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy
+from sb3_cchain.methods.switch_or_interval import SwitchOrInterval
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.injection_policies import Injectable
-from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -20,7 +19,7 @@ _ACTOR = ("pi_features_extractor", "mlp_extractor.policy_net", "action_net")
 _CRITIC = ("vf_features_extractor", "mlp_extractor.value_net", "value_net")
 
 
-class LayerReset(TaskBoundary):
+class LayerReset(SwitchOrInterval):
     """
     Initialises the last layers of each network again, every ``interval`` environment steps or at each task switch, and keeps
     the data: DQN's replay buffer stays.
@@ -54,16 +53,15 @@ class LayerReset(TaskBoundary):
         the policies of :class:`PlasticityInjection`, and with ``interval=None`` for an environment that is not continual
     """
 
+    name = "layer_reset"
+
     model: OnPolicyAlgorithm | DQN
 
     def __init__(self, n_layers: int | None = 1, interval: int | None = None):
-        super().__init__()
+        super().__init__(interval)
         if n_layers is not None:
             check_number("n_layers", n_layers, 1, integer=True)
-        if interval is not None:
-            check_number("interval", interval, 1, integer=True)
         self.n_layers = n_layers
-        self.interval = interval
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, (OnPolicyAlgorithm, DQN)):
@@ -77,34 +75,8 @@ class LayerReset(TaskBoundary):
         if self.n_layers is not None and self.n_layers > n_layers:
             raise ValueError(f"`n_layers` must be at most {n_layers}, the layers of the network, got {self.n_layers!r}")
 
-    def _on_training_start(self) -> None:
-        self.n_resets = 0
-        if self.interval is None:
-            super()._on_training_start()
-        # As long as nobody looked, the step that training goes on from
-        known = getattr(self.model, "layer_reset_timesteps", self.num_timesteps)
-        self._timesteps = min(known, self.num_timesteps)
-
-    def _on_rollout_start(self) -> None:
-        if self.interval is None:
-            super()._on_rollout_start()
-            return
-        before, self._timesteps = self._timesteps, self.num_timesteps
-        self.model.layer_reset_timesteps = self._timesteps  # type: ignore[union-attr]
-        if self._timesteps // self.interval > before // self.interval:
-            self._reset()
-
-    def _on_task_switch(self) -> None:
-        self._reset()
-
-    def _reset(self) -> None:
+    def _act(self) -> None:
         reset_layers(uncompiled(self.model.policy), fresh_policy(self.model), self.n_layers)
-        for reducer in churn_reducers(self):
-            reducer.forget_reference()
-        self.n_resets += 1
-
-    def _on_rollout_end(self) -> None:
-        self.logger.record("layer_reset/n_resets", self.n_resets)
 
 
 def network_layers(policy: nn.Module) -> list[list[list[str]]]:

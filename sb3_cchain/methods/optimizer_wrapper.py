@@ -37,6 +37,8 @@ class OptimizerWrapper(th.optim.Optimizer):
 
     # Key in the state, and prefix in the log
     name: ClassVar[str]
+    # Whether there are `base_class` and `base_kwargs`
+    has_arguments_of_base: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -140,14 +142,24 @@ class OptimizerWrapper(th.optim.Optimizer):
         """
         return self.base.metrics() if isinstance(self.base, OptimizerWrapper) else {}
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """
+        :param state_dict: As for any optimiser
+        """
+        self.base.load_state_dict(state_dict)  # which may take other state than torch's optimisers
+        self._unshare()
+
+    def _unshare(self) -> None:
+        self.state[self.name] = dict(self.own_state)  # a copy, because the owner of the saved state goes on changing it
+
     def __getstate__(self) -> dict[str, Any]:
         # As torch's: without hooks, and without methods that were replaced on the instance
         return {name: value for name, value in vars(self).items() if not (name.startswith("_optimizer") or callable(value))}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Called by `copy`, `pickle`, and by `load_state_dict` with new groups and state
+        # Called by `copy` and `pickle` with new groups and state
         base_state = {name: value for name, value in state.items() if name in ("param_groups", "state")}
         super().__setstate__({name: value for name, value in state.items() if name not in base_state})
         if base_state:
             self.base.__setstate__(base_state)
-            self.state[self.name] = dict(self.own_state)  # a copy, because the owner of the saved state goes on changing it
+            self._unshare()

@@ -17,8 +17,14 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_cchain.algorithms import CChainA2C, CChainDDPG, CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.continual_backprop import ContinualBackprop
+from sb3_cchain.methods.ewc import EWC
+from sb3_cchain.methods.ewc_consolidation import EWCConsolidation
+from sb3_cchain.methods.fire import FIRE
+from sb3_cchain.methods.kron import Kron
 from sb3_cchain.methods.l2_init import L2Init
 from sb3_cchain.methods.layer_reset import LayerReset
+from sb3_cchain.methods.muon import Muon
 from sb3_cchain.methods.normalize_and_project import NormalizeAndProject
 from sb3_cchain.methods.optimizer_metrics import OptimizerMetrics
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
@@ -26,10 +32,23 @@ from sb3_cchain.methods.oracle import Oracle
 from sb3_cchain.methods.parseval import Parseval
 from sb3_cchain.methods.plasticity_injection import PlasticityInjection
 from sb3_cchain.methods.redo import ReDo
+from sb3_cchain.methods.regrama import ReGraMa
+from sb3_cchain.methods.self_normalized_resets import SelfNormalizedResets
 from sb3_cchain.methods.shrink_and_perturb import ShrinkAndPerturb
+from sb3_cchain.methods.spectral_regularization import SpectralRegularization
 from sb3_cchain.methods.trac import TRAC
+from sb3_cchain.methods.upgd import UPGD
 from sb3_cchain.methods.weight_clipping import WeightClipping
-from sb3_cchain.networks import CReLU, CReLUPolicy, FourierFeatures, FourierPolicy, InjectionPolicy, LayerNormPolicy
+from sb3_cchain.networks import (
+    CReLU,
+    CReLUPolicy,
+    FourierFeatures,
+    FourierPolicy,
+    InjectionPolicy,
+    LayerNormPolicy,
+    SimBaPolicy,
+    SpectralNormPolicy,
+)
 
 
 @dataclass(frozen=True)
@@ -188,6 +207,66 @@ REGISTRY = (
         *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
         policy=FourierPolicy,
         policy_kwargs={"activation_fn": FourierFeatures},
+    ),
+    Method(
+        *("continual_backprop", "ppo_continual_backprop", PPO, "Continual backprop", "olivedrab", PLASTICITY_PAGE),
+        callbacks=(ContinualBackprop,),
+        grid={"replacement_rate": [1e-5, 1e-4, 1e-3], "maturity_threshold": [1000, 10_000]},  # a decade around the paper's
+    ),
+    Method(
+        *("regrama", "ppo_regrama", PPO, "ReGraMa", "darkorchid", PLASTICITY_PAGE),
+        callbacks=(ReGraMa,),
+        # τ: the paper's, units without any gradient, and ten times the paper's. Interval in iterations, as of ReDo
+        grid={"tau": [0.0, 0.01, 0.1], "interval": [1, 10, 100]},
+    ),
+    Method(
+        *("self_normalized_resets", "ppo_self_normalized_resets", PPO, "Self-normalized resets", "peru", PLASTICITY_PAGE),
+        callbacks=(SelfNormalizedResets,),
+        grid={"eta": [0.01, 0.02, 0.04, 0.08]},
+    ),
+    Method(
+        *("fire", "ppo_fire", PPO, "FIRE", "orangered", PLASTICITY_PAGE),
+        callbacks=(FIRE,),
+        grid={"n_iterations": [5, 10]},
+    ),
+    Method(
+        *("spectral_regularization", "ppo_spectral_regularization", PPO, "Spectral regularisation", "tomato", OPTIMIZER_PAGE),
+        optimizer_class=SpectralRegularization,
+        callbacks=(OptimizerMetrics,),
+        grid={"coef": [1e-5, 1e-4, 1e-3, 1e-2], "power": [1, 2]},
+    ),
+    Method(
+        *("ewc", "ppo_ewc", PPO, "EWC", "mediumseagreen", OPTIMIZER_PAGE),
+        optimizer_class=EWC,
+        callbacks=(EWCConsolidation, OptimizerMetrics),
+        grid={"coef": [1.0, 100.0, 10_000.0], "decay": [0.5, 1.0]},
+    ),
+    Method(
+        *("upgd", "ppo_upgd", PPO, "UPGD", "rebeccapurple", OPTIMIZER_PAGE),
+        optimizer_class=UPGD,
+        callbacks=(OptimizerMetrics,),
+        grid={"sigma": [0.0, 0.001, 0.01], "beta": [0.99, 0.999]},
+    ),
+    Method(
+        *("muon", "ppo_muon", PPO, "Muon", "deeppink", OPTIMIZER_PAGE),
+        optimizer_class=Muon,
+        optimizer_kwargs={"n_output_layers": 2},
+        callbacks=(OptimizerMetrics,),
+        grid={"lr_factor": [0.3, 1.0, 3.0]},
+    ),
+    Method(
+        *("kron", "ppo_kron", PPO, "Kron", "steelblue", OPTIMIZER_PAGE),
+        optimizer_class=Kron,
+        grid={"update_probability": [0.03, 0.1, 1.0]},
+    ),
+    Method(
+        *("spectral_norm", "ppo_spectral_norm", PPO, "Spectral normalisation", "slategray", PLASTICITY_PAGE),
+        policy=SpectralNormPolicy,
+    ),
+    Method(
+        *("simba", "ppo_simba", PPO, "SimBa", "chocolate", PLASTICITY_PAGE),
+        policy=SimBaPolicy,
+        policy_kwargs={"net_arch": {"pi": [128], "vf": [512, 512]}},
     ),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),

@@ -12,7 +12,11 @@ from sb3_cchain.networks.mlp_policies import (
     FourierPolicy,
     LayerNormDQNPolicy,
     LayerNormPolicy,
+    SpectralNormDQNPolicy,
+    SpectralNormPolicy,
 )
+from sb3_cchain.networks.simba import SimBaDQNPolicy, SimBaPolicy, SimBaSACPolicy
+from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 from sb3_cchain.networks.transfer import Transferred, transfer
 
 __all__ = [
@@ -29,6 +33,12 @@ __all__ = [
     "LayerNormDQNPolicy",
     "LayerNormPolicy",
     "MinAtarCNN",
+    "SimBaDQNPolicy",
+    "SimBaPolicy",
+    "SimBaSACPolicy",
+    "SpectralNormDQNPolicy",
+    "SpectralNormLinear",
+    "SpectralNormPolicy",
     "Transferred",
     "make_lean",
     "transfer",

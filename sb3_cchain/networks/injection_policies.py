@@ -77,6 +77,12 @@ class InjectableOutput(Injectable):
         return self.old(old) + (self.new(new) - self.copy(copied))
 
 
+def _check_activation(policy: ActorCriticPolicy | DQNPolicy) -> None:
+    name, activation = type(policy).__name__, policy.activation_fn
+    if getattr(activation, "expansion", 1) != 1:  # SB3's MLPs do not know them
+        raise ValueError(f"`activation_fn` must keep the number of features for {name}, got {activation.__name__}")
+
+
 class InjectionPolicy(ActorCriticPolicy):
     """
     SB3's ``MlpPolicy`` for PPO and A2C, for :class:`~sb3_cchain.methods.PlasticityInjection`. Until the injection it computes
@@ -88,12 +94,13 @@ class InjectionPolicy(ActorCriticPolicy):
 
     :param args: Arguments of ``ActorCriticPolicy``
     :param kwargs: Keyword arguments of ``ActorCriticPolicy``
-    :raises ValueError: With ``use_sde=True``, whose noise reads the hidden layers
+    :raises ValueError: With ``use_sde=True``, whose noise reads the hidden layers, and with CReLU or Fourier features
     """
 
     def _build(self, lr_schedule: Schedule) -> None:
         if self.use_sde:
             raise ValueError("`use_sde` must be False for InjectionPolicy, got True")
+        _check_activation(self)
         super()._build(lr_schedule)
         extractor = self.mlp_extractor
         extractor.policy_net = nn.Sequential(InjectableHidden(extractor.policy_net))
@@ -109,12 +116,14 @@ class InjectionDQNPolicy(DQNPolicy):
 
     :param args: Arguments of ``DQNPolicy``
     :param kwargs: Keyword arguments of ``DQNPolicy``
+    :raises ValueError: With CReLU or Fourier features
     """
 
     def make_q_net(self) -> QNetwork:
         """
         :return: A Q-network
         """
+        _check_activation(self)
         network = super().make_q_net()
         *hidden, output = network.q_net
         network.q_net = nn.Sequential(InjectableHidden(nn.Sequential(*hidden)), InjectableOutput(output))

@@ -1,17 +1,23 @@
-"""SB3's MLP policies with LayerNorm, with CReLU or with deep Fourier features."""
+"""SB3's MLP policies with LayerNorm, with CReLU, with deep Fourier features or with spectral normalisation."""
 
 from typing import Any, ClassVar
 
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
 from sb3_cchain.networks.activations import CReLU, FourierFeatures
+from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 
 
 def hidden_layers(
-    n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module], layer_norm: bool
+    n_inputs: int,
+    net_arch: list[int],
+    activation_fn: type[nn.Module],
+    layer_norm: bool,
+    linear: type[nn.Linear] = nn.Linear,
 ) -> tuple[list[nn.Module], int]:
     """
     Linear layers, each followed by a LayerNorm (on request) and the activation.
@@ -21,11 +27,12 @@ def hidden_layers(
     :param activation_fn: Makes the activation; with :class:`CReLU` and
         :class:`FourierFeatures` a layer has twice as many outputs as units
     :param layer_norm: Whether there is a LayerNorm before each activation
+    :param linear: Makes the linear layers
     :return: The modules, and the number of outputs of the last one
     """
     modules: list[nn.Module] = []
     for n_units in net_arch:
-        modules.append(nn.Linear(n_inputs, n_units))
+        modules.append(linear(n_inputs, n_units))
         if layer_norm:
             modules.append(nn.LayerNorm(n_units))
         modules.append(activation_fn())
@@ -35,6 +42,7 @@ def hidden_layers(
 
 class _MlpVariant(ActorCriticPolicy):
     layer_norm: ClassVar[bool] = False
+    linear: ClassVar[type[nn.Linear]] = nn.Linear
 
     def _build_mlp_extractor(self) -> None:
         if isinstance(self.net_arch, dict):
@@ -42,8 +50,9 @@ class _MlpVariant(ActorCriticPolicy):
         else:
             pi = vf = self.net_arch
         extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
-        policy_net, extractor.latent_dim_pi = hidden_layers(self.features_dim, pi, self.activation_fn, self.layer_norm)
-        value_net, extractor.latent_dim_vf = hidden_layers(self.features_dim, vf, self.activation_fn, self.layer_norm)
+        settings = (self.activation_fn, self.layer_norm, self.linear)
+        policy_net, extractor.latent_dim_pi = hidden_layers(self.features_dim, pi, *settings)
+        value_net, extractor.latent_dim_vf = hidden_layers(self.features_dim, vf, *settings)
         extractor.policy_net, extractor.value_net = nn.Sequential(*policy_net), nn.Sequential(*value_net)
         self.mlp_extractor = extractor.to(self.device)
 
@@ -88,15 +97,37 @@ class FourierPolicy(_MlpVariant):
         super().__init__(*args, **{"activation_fn": FourierFeatures, **kwargs})
 
 
+class SpectralNormPolicy(_MlpVariant):
+    """
+    SB3's ``MlpPolicy`` for PPO and A2C whose hidden layers are divided by their greatest singular value, as
+    :class:`SpectralNormLinear` describes. The output layers are not, so the outputs can grow; neither are those of a features
+    extractor.
+
+    In reinforcement learning: Gogianu et al. (ICML 2021), https://arxiv.org/abs/2105.05246; Bjorck et al. (NeurIPS 2021),
+    https://arxiv.org/abs/2106.01151. They normalise some of the layers; here it is all hidden ones.
+
+    All arguments are those of ``ActorCriticPolicy``, with the same defaults; ``net_arch`` is a list or a dict.
+    """
+
+    linear = SpectralNormLinear
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        for module in self.modules():
+            if isinstance(module, SpectralNormLinear):
+                module.iterate(15)  # for the weights of `ortho_init`
+
+
 class _QNetworkVariant(QNetwork):
-    def __init__(self, *args: Any, layer_norm: bool, **kwargs: Any):
+    def __init__(self, *args: Any, layer_norm: bool, linear: type[nn.Linear], **kwargs: Any):
         super().__init__(*args, **kwargs)
-        modules, n_features = hidden_layers(self.features_dim, self.net_arch, self.activation_fn, layer_norm)
+        modules, n_features = hidden_layers(self.features_dim, self.net_arch, self.activation_fn, layer_norm, linear)
         self.q_net = nn.Sequential(*modules, nn.Linear(n_features, int(self.action_space.n)))
 
 
 class _DQNVariant(DQNPolicy):
     layer_norm: ClassVar[bool] = False
+    linear: ClassVar[type[nn.Linear]] = nn.Linear
 
     def make_q_net(self) -> QNetwork:
         """
@@ -104,7 +135,7 @@ class _DQNVariant(DQNPolicy):
         """
         # Extractors of their own for the network and its target, as in SB3
         net_args = self._update_features_extractor(self.net_args, features_extractor=None)
-        return _QNetworkVariant(**net_args, layer_norm=self.layer_norm).to(self.device)
+        return _QNetworkVariant(**net_args, layer_norm=self.layer_norm, linear=self.linear).to(self.device)
 
 
 class LayerNormDQNPolicy(_DQNVariant):
@@ -114,6 +145,15 @@ class LayerNormDQNPolicy(_DQNVariant):
     """
 
     layer_norm = True
+
+
+class SpectralNormDQNPolicy(_DQNVariant):
+    """
+    SB3's ``MlpPolicy`` for DQN with hidden layers of spectral norm 1, as in :class:`SpectralNormPolicy`. All arguments are
+    those of ``DQNPolicy``, with the same defaults.
+    """
+
+    linear = SpectralNormLinear
 
 
 class CReLUDQNPolicy(_DQNVariant):

@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.policy_networks import PolicyNetworks
+from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 
 # Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
 _MODE_FREE_PACKAGES = (
@@ -38,7 +39,7 @@ _MODE_FREE_PACKAGES = (
     "torch.nn.modules.pooling",
     "torch.nn.modules.rnn",
 )
-_MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention)
+_MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention, SpectralNormLinear)
 
 
 def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:

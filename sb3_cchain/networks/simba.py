@@ -1,0 +1,168 @@
+"""The residual networks of SimBa, as policies for PPO, DQN and SAC."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+
+class SimBaBlock(nn.Module):
+    """
+    The input, plus a network of one hidden layer, four times as wide, of the normalised input.
+
+    :param width: Number of inputs and outputs
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.residual = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: ``(batch_size, width)``
+        :return: The same shape
+        """
+        return inputs + self.residual(inputs)
+
+
+class SimBaTrunk(nn.Sequential):
+    """
+    A linear layer, blocks, and a LayerNorm.
+
+    :param n_inputs: Number of inputs
+    :param net_arch: Width of each block, all the same
+    :raises ValueError: When there is no block, or their widths differ
+    """
+
+    def __init__(self, n_inputs: int, net_arch: list[int]):
+        if not net_arch or len(set(net_arch)) > 1:
+            raise ValueError(
+                f"`net_arch` must give each network one width or more, all the same, as [128, 128]; got {net_arch!r}"
+            )
+        width = net_arch[0]
+        super().__init__(nn.Linear(n_inputs, width), *(SimBaBlock(width) for _ in net_arch), nn.LayerNorm(width))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draw new weights: orthogonal before the blocks, He's normal ones in them."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.kaiming_normal_(module.weight)
+                nn.init.zeros_(module.bias)
+            elif isinstance(module, nn.LayerNorm):
+                module.reset_parameters()
+        nn.init.orthogonal_(self[0].weight)  # type: ignore[arg-type]
+
+
+class SimBaPolicy(ActorCriticPolicy):
+    """
+    SB3's ``MlpPolicy`` for PPO and A2C with the network of SimBa in place of the hidden layers: a linear layer, residual
+    blocks that begin with a LayerNorm, and a LayerNorm at the end.
+
+    Paper: "SimBa: simplicity bias for scaling up parameters in deep reinforcement learning",
+    https://arxiv.org/abs/2410.09754 (Lee et al., ICLR 2025). ``net_arch`` gives the width of each block, all the same:
+    ``dict(pi=[128], vf=[512, 512])``, the default, is one block of 128 for the actor and two of 512 for the critic, as the
+    paper has for SAC. A block of width n has 8 n² weights. The layers have the initialisation of the paper's code, also
+    with ``ortho_init``, which initialises the output layers; ``activation_fn`` has no effect.
+
+    The paper's third part, the running normalisation of the observations, is the work of ``VecNormalize(norm_reward=False)``,
+    or of :class:`~sb3_cchain.envs.TaskVecNormalize`.
+
+    :param args: Arguments of ``ActorCriticPolicy``
+    :param kwargs: Keyword arguments of ``ActorCriticPolicy``
+    :raises ValueError: When a network has no block, or blocks of different widths
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"net_arch": dict(pi=[128], vf=[512, 512]), **kwargs})
+
+    def _build_mlp_extractor(self) -> None:
+        pi, vf = (self.net_arch["pi"], self.net_arch["vf"]) if isinstance(self.net_arch, dict) else [self.net_arch] * 2
+        extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
+        extractor.policy_net, extractor.latent_dim_pi = SimBaTrunk(self.features_dim, pi), pi[-1]
+        extractor.value_net, extractor.latent_dim_vf = SimBaTrunk(self.features_dim, vf), vf[-1]
+        self.mlp_extractor = extractor.to(self.device)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        for trunk in (self.mlp_extractor.policy_net, self.mlp_extractor.value_net):
+            assert isinstance(trunk, SimBaTrunk)
+            trunk.reset_parameters()  # which `ortho_init` has initialised otherwise
+
+
+class SimBaQNetwork(QNetwork):
+    """
+    SB3's Q-network with a :class:`SimBaTrunk` in place of the hidden layers.
+
+    :param args: Arguments of ``QNetwork``
+    :param kwargs: Keyword arguments of ``QNetwork``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        trunk = SimBaTrunk(self.features_dim, self.net_arch)
+        self.q_net = nn.Sequential(trunk, nn.Linear(self.net_arch[-1], int(self.action_space.n)))
+
+
+class SimBaDQNPolicy(DQNPolicy):
+    """
+    SB3's ``MlpPolicy`` for DQN with the network of SimBa, as :class:`SimBaPolicy`. ``net_arch`` is a list of the blocks'
+    widths; the default ``[512, 512]`` is that of the paper's critics.
+
+    :param args: Arguments of ``DQNPolicy``
+    :param kwargs: Keyword arguments of ``DQNPolicy``
+    :raises ValueError: When the network has no block, or blocks of different widths
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"net_arch": [512, 512], **kwargs})
+
+    def make_q_net(self) -> QNetwork:
+        """
+        :return: A Q-network
+        """
+        net_args = self._update_features_extractor(self.net_args, features_extractor=None)
+        return SimBaQNetwork(**net_args).to(self.device)
+
+
+class SimBaSACPolicy(SACPolicy):
+    """
+    SB3's ``MlpPolicy`` for SAC with the network of SimBa, as :class:`SimBaPolicy`, for the actor and each critic.
+    ``net_arch`` is a list, or a dict as the default ``dict(pi=[128], qf=[512, 512])``, which is the paper's.
+
+    :param args: Arguments of ``SACPolicy``
+    :param kwargs: Keyword arguments of ``SACPolicy``
+    :raises ValueError: When a network has no block, or blocks of different widths
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"net_arch": dict(pi=[128], qf=[512, 512]), **kwargs})
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """
+        :param features_extractor: As for ``SACPolicy``
+        :return: An actor
+        """
+        actor = super().make_actor(features_extractor)
+        actor.latent_pi = SimBaTrunk(actor.features_dim, actor.net_arch).to(self.device)
+        return actor
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        """
+        :param features_extractor: As for ``SACPolicy``
+        :return: A critic
+        """
+        critic = super().make_critic(features_extractor)
+        net_arch: Any = self.critic_kwargs["net_arch"]
+        n_inputs = critic.features_extractor.features_dim + get_action_dim(self.action_space)
+        for index in range(critic.n_critics):
+            network = nn.Sequential(SimBaTrunk(n_inputs, net_arch), nn.Linear(net_arch[-1], 1)).to(self.device)
+            critic.q_networks[index] = network
+            critic.add_module(f"qf{index}", network)
+        return critic
