@@ -24,8 +24,8 @@ PUBLIC = (
 )
 DIRECTIVE = re.compile(r"^\.\. auto(class|function|module):: (\S+)\n(?:   :members: ?(.*))?", flags=re.MULTILINE)
 
-# GitHub shows directives as they are typed, so they are on pages of their own; the methods' pages still have theirs
-WITH_DIRECTIVES = {"contributing", "changelog", "modules/optimizers", "modules/plasticity"}
+# GitHub shows directives as they are typed, so they are on pages of their own
+WITH_DIRECTIVES = {"contributing", "changelog"}
 
 
 def pages() -> list[str]:

@@ -49,7 +49,7 @@ class CChainCallback(FiniteCheck):
     :param churn_component: As for ``CChainPPO``; another one than ``"full"`` is for PPO alone
     :param churn_reference: As for ``CChainPPO``; another one than ``"independent"`` is for PPO and TRPO
     :param churn_batch_size: As for ``CChainPPO``; another one than 1 is for PPO and TRPO
-    :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.make_lean`
+    :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.networks.make_lean`
     :param churn_target: As for ``ChurnAlgorithm``
     :raises ValueError: Naming the argument that is out of its range; when training starts, for one that the model's algorithm
         does not have, for a second CChainCallback in the same ``learn()``, and for one that another callback holds
