@@ -31,6 +31,7 @@ PPO_METHODS = [method for method in REGISTRY if method.is_related and issubclass
 
 # Two methods that do not go together, and how training says so
 REFUSED = {
+    ("adam_rel", "kron"): "AdamRel needs an optimiser with a step count, as Adam has, got Kron",
     ("layer_reset", "plasticity_injection"): "LayerReset does not know heads for plasticity injection, got InjectionPolicy",
     ("plasticity_injection", "redo"): "ReDo does not know heads for plasticity injection, got InjectionPolicy",
     ("plasticity_injection", "regrama"): "ReGraMa does not know heads for plasticity injection, got InjectionPolicy",
@@ -47,7 +48,7 @@ REFUSED = {
 def compose(one, other, algorithm="PPO"):
     """A model and callbacks with two methods: the optimiser of the first around that of the second."""
     methods = (one, other)
-    policy_kwargs = {"net_arch": [8], **one.policy_kwargs, **other.policy_kwargs}
+    policy_kwargs = {**one.policy_kwargs, **other.policy_kwargs, "net_arch": [8]}
     # An activation goes into any policy, and a policy that the optimiser's row recommends gives way
     policies = sorted(
         (method for method in methods if method.policy != "MlpPolicy"),

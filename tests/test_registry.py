@@ -9,7 +9,7 @@ import pytest
 import torch as th
 import yaml
 from matplotlib.colors import to_rgb
-from stable_baselines3 import DQN
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks.grid.run import suite_methods
@@ -211,3 +211,10 @@ def test_a_compiled_policy_learns_as_the_policy(method):
     assert all(th.equal(one, other) for one, other in pairs)
     logged = [{tag for tag in model.logger.name_to_value if tag.startswith(("health/", "redo/"))} for model in models]
     assert logged[0] == logged[1]
+
+
+def test_the_page_on_choosing_has_a_row_for_each_method_of_ppo():
+    page = (ROOT / "docs/which_method.md").read_text()
+    rows = re.findall(r"^\| ([^|]+) \| .*\|$", page.partition("## Method by method")[2], flags=re.MULTILINE)
+    labels = {method.label for method in REGISTRY if issubclass(method.algorithm, PPO) and method.name != "vanilla"}
+    assert set(rows) - {"method"} == labels

@@ -121,7 +121,7 @@ def policy_of(method, algorithm):
 
 def make(method, algorithm, off=False, env=None, **settings):
     """A model and callbacks: the method with another algorithm, and without effect on request."""
-    policy_kwargs = {"net_arch": [8, 8], **method.policy_kwargs}
+    policy_kwargs = {**method.policy_kwargs, "net_arch": [8, 8]}
     arguments = SHELF[method.name].off if off else {}
     if method.optimizer_class is not None:
         kwargs = {**optimizer_arguments(method), **arguments}
