@@ -74,7 +74,7 @@ CONTENTS = {
     "Project": ["comparison", "contributing", "changelog", "citing"],
 }
 # Pages that need not be there
-OPTIONAL = {"which_method", "modules/doctor"}
+OPTIONAL = {"modules/doctor"}
 
 
 def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
