@@ -32,7 +32,7 @@ from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.algorithms.churn_targets import churn_kind
-from sb3_cchain.analysis import EvalAllTasks, NetworkHealth, NTKCallback
+from sb3_cchain.analysis import Doctor, EvalAllTasks, NetworkHealth, NTKCallback
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, find_checkpoint, resume
 from sb3_cchain.checkpoint.training_description import constructor_arguments
@@ -253,7 +253,10 @@ CASES = {
     ),
     "PPO NTK acrobot": Case(
         *(PPO, vec_env("Continual/Acrobot-v1", **ACROBOT), ON_POLICY),
-        callbacks=lambda: [NTKCallback(n_minibatches=4, interval=2, picture_interval=0), NetworkHealth(interval=2)],
+        callbacks=lambda: [
+            *(NTKCallback(n_minibatches=4, interval=2, picture_interval=0), NetworkHealth(interval=2)),
+            Doctor(interval=1, patience=1),
+        ],
         checkpoint_last=True,
         continual=True,
     ),

@@ -84,7 +84,7 @@ def trained_groups(model: BaseAlgorithm) -> dict[str, dict[str, nn.Parameter]]:
         if parameter in trained:
             layer, _, _ = name.rpartition(".")
             is_layer = not any(policy.get_submodule(layer).children())
-            groups.setdefault(_group(layer if is_layer else name), {})[name] = parameter
+            groups.setdefault(group_of(layer if is_layer else name), {})[name] = parameter
     return groups
 
 
@@ -120,8 +120,8 @@ def _unit_health(policy: BasePolicy, observations: PyTorchObs, tau: float) -> di
     dormant: dict[str, list[th.Tensor]] = {}
     active: dict[str, list[th.Tensor]] = {}
     features: dict[str, th.Tensor] = {}
-    for name, outputs in _activations(policy, observations).items():
-        module, group = policy.get_submodule(name), _group(name)
+    for name, outputs in hidden_activations(policy, observations).items():
+        module, group = policy.get_submodule(name), group_of(name)
         for output in outputs:
             units = output.unflatten(1, (2, -1)).sum(dim=1) if isinstance(module, CReLU) else output
             dormant.setdefault(group, []).append(dormant_scores(mean_activity(units)) <= tau)
@@ -145,12 +145,21 @@ def _shares(name: str, flags: dict[str, list[th.Tensor]]) -> dict[str, float]:
     return {name: n_true / n_all, **{f"{name}/{group}": true / total for group, (true, total) in counts.items()}}
 
 
-def _group(name: str) -> str:
+def group_of(name: str) -> str:
+    """
+    :param name: Name of a module of a policy
+    :return: That of its group of layers
+    """
     return ".".join(name.split(".")[:2])
 
 
-def _activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Tensor]]:
-    """The hidden outputs of each activation function, ``(n_observations, n_units, ...)``, in the order of their first use."""
+def hidden_activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Tensor]]:
+    """
+    :param policy: A policy, not compiled
+    :param observations: Observations, as the policy gets them
+    :return: The hidden outputs of each activation function by the name of its module, ``(n_observations, n_units, ...)``, in
+        the order of their first use
+    """
     names = {
         m: name for name, m in policy.named_modules() if isinstance(m, (*ELEMENTWISE_ACTIVATIONS, CReLU, FourierFeatures))
     }
@@ -177,7 +186,9 @@ def _activations(policy: Any, observations: PyTorchObs) -> dict[str, list[th.Ten
 def _act(policy: Any, observations: PyTorchObs) -> Any:
     """Run the policy; the forward pass of an actor-critic policy includes its values."""
     if not hasattr(policy, "lstm_actor"):
-        return policy(observations, deterministic=True)
+        is_ars = hasattr(policy, "action_net") and not hasattr(policy, "predict_values")
+        # ARS never acts at random, and has no such argument
+        return policy(observations) if is_ars else policy(observations, deterministic=True)
     memory = empty_memory(policy, observations)
     episode_starts = th.ones(n_observations(observations), device=policy.device)
     return policy(observations, SimpleNamespace(pi=memory, vf=memory), episode_starts, deterministic=True)

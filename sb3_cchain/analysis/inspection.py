@@ -1,35 +1,36 @@
-"""Churn, the neural tangent kernel and the health of the networks of a model, after the fact."""
+"""Churn, the neural tangent kernel and the health of the networks of a model, and what is wrong with it, after the fact."""
 
-import inspect
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 from rich.table import Table
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
-from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_cchain.algorithms import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
+from sb3_cchain.analysis import ChurnMonitor, Doctor, NetworkHealth, NTKCallback
+from sb3_cchain.analysis.findings import CHECKS, Finding, as_json, diagnose
 from sb3_cchain.analysis.health import trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.ntk import has_ntk
 from sb3_cchain.analysis.plots import plot_models
-from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.signal import is_continual
 from sb3_cchain.validation import check_number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Drawn for each group of layers, by their names after "health/"
 GROUP_FIGURES = (
@@ -41,6 +42,8 @@ GROUP_FIGURES = (
     "distance_from_init",
 )
 
+_MONITORS = (ChurnMonitor, Doctor, NetworkHealth, NTKCallback)
+
 # Iterations or episodes until the logger is emptied
 _NEVER = 10**9
 
@@ -48,18 +51,39 @@ _NEVER = 10**9
 @dataclass
 class Inspection:
     """
-    The figures of one model.
+    The figures of one model, and what is wrong with it.
 
     :param name: Name of the model
     :param figures: By name as in TensorBoard, and ``rollout/mean_return``, ``rollout/n_episodes``, ``rollout/n_steps``
-    :param ntk: The neural tangent kernel
+    :param ntk: The neural tangent kernel; None for algorithms of which it cannot be computed
     :param parameters: A copy of the parameters of each group of layers, by name
+    :param algorithm: Name of the class of its algorithm
+    :param num_timesteps: Environment steps that it was trained for
+    :param symptoms: What the findings were made from
+    :param findings: What is wrong with it
     """
 
     name: str
     figures: dict[str, float]
-    ntk: th.Tensor
-    parameters: dict[str, dict[str, th.Tensor]]
+    ntk: th.Tensor | None = None
+    parameters: dict[str, dict[str, th.Tensor]] = field(default_factory=dict)
+    algorithm: str = ""
+    num_timesteps: int = 0
+    symptoms: Symptoms = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """
+        :return: The findings, and every measure, as plain values
+        """
+        return {
+            "name": self.name,
+            "algorithm": self.algorithm,
+            "num_timesteps": self.num_timesteps,
+            "findings": [finding.to_json() for finding in self.findings],
+            "measures": {name: as_json(value) for name, value in self.symptoms.items()},
+            "not_measured": [check.name for check in CHECKS if check.worst(self.symptoms) is None],
+        }
 
 
 def inspect_model(
@@ -71,30 +95,38 @@ def inspect_model(
 ) -> Inspection:
     """
     Roll the model out and train it a little, as its training would go on, and look at it with
-    :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` and
-    :class:`~sb3_cchain.analysis.NetworkHealth`. This changes the model.
+    :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` where there is a kernel,
+    :class:`~sb3_cchain.analysis.NetworkHealth` and :class:`~sb3_cchain.analysis.Doctor`. This changes the model.
 
     On-policy, that is one iteration. Off-policy, ``n_steps`` steps fill a replay buffer, which is not saved with a model, and
     ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
     moment when the model was saved; where the learning rate had come down to 0, there is no churn.
 
-    :param model: A PPO, A2C, DQN or one of sb3-contrib's that the monitors know, with an environment
+    ARS is not trained, but only rolled out. A model whose parameters are not finite, or become so in this training, cannot
+    act: of it there are only the findings.
+
+    :param model: A model of any algorithm of Stable-Baselines3 and sb3-contrib, with an environment
     :param name: What it is called in reports
     :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
     :param n_updates: Gradient updates, for off-policy algorithms
     :param callbacks: Callbacks of its training on which the training depends
     :return: What was found
-    :raises TypeError: For other algorithms
-    :raises ValueError: Naming the argument that is out of its range; for a model without an environment, or with parameters
-        that are not finite
+    :raises ValueError: Naming the argument that is out of its range; for a model without an environment
     """
     check_number("n_steps", n_steps, 1, integer=True)
     check_number("n_updates", n_updates, 1, integer=True)
-    _check_model(model)
+    _check_env(model)
+    about: dict[str, Any] = {"algorithm": type(model).__name__, "num_timesteps": model.num_timesteps}
+    if not is_finite(model):
+        symptoms = weight_symptoms(model)
+        return Inspection(name, {}, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
+    if not isinstance(model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+        symptoms, figures = _roll_out(model, n_steps)
+        return Inspection(name, figures, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
     model.set_logger(Logger(folder=None, output_formats=[]))
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
-    elif isinstance(model, OffPolicyAlgorithm):
+    else:
         model.learning_starts = model.num_timesteps  # the rollout that fills the buffer has no random actions
         model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         model.gradient_steps = n_updates
@@ -105,19 +137,25 @@ def inspect_model(
         for group, group_parameters in trained_groups(model).items()
     }
     knows_its_start = hasattr(model, "initial_parameters")
-    ntk, health = NTKCallback(interval=1, picture_interval=0), NetworkHealth(interval=1)
+    health, doctor = NetworkHealth(interval=1), Doctor(interval=1, patience=_NEVER)
+    monitors: list[BaseCallback] = [ChurnMonitor(interval=1), health, doctor]
+    ntk = NTKCallback(interval=1, picture_interval=0) if has_ntk(model) else None
+    if ntk is not None:
+        monitors.append(ntk)
     # The monitors that it was trained with are replaced by those above
-    others = [callback for callback in callbacks if not isinstance(callback, (ChurnMonitor, NTKCallback, NetworkHealth))]
+    others = [callback for callback in callbacks if not isinstance(callback, _MONITORS)]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
         others.insert(0, TaskSync())
-    # Schedules keep their present values instead of going to their ends
-    with replaced(model, "_update_current_progress_remaining", lambda *_: None):
-        model.learn(
-            n_steps,
-            callback=[*others, ChurnMonitor(interval=1), ntk, health],
-            log_interval=_NEVER,
-            reset_num_timesteps=False,
-        )
+    try:
+        # Schedules keep their present values instead of going to their ends
+        with replaced(model, "_update_current_progress_remaining", lambda *_: None):
+            model.learn(n_steps, callback=[*others, *monitors], log_interval=_NEVER, reset_num_timesteps=False)
+    except ValueError:
+        if is_finite(model):
+            raise
+        # An update has made parameters infinite, and PyTorch's distributions do not take them
+        symptoms = {**doctor.symptoms, **weight_symptoms(model)}
+        return Inspection(name, {}, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
     figures = {
         tag: float(value)
         for tag, value in model.logger.name_to_value.items()
@@ -125,47 +163,41 @@ def inspect_model(
         and (knows_its_start or not tag.startswith("health/distance_from_init"))
     }
     figures.update({f"health/{name}": norm for name, norm in health.gradient_norms().items()})
-    episodes: Iterable[dict[str, float]] = model.ep_info_buffer or []
+    figures.update(_rollout_figures(model.ep_info_buffer or [], n_steps))
+    matrix = None if ntk is None else ntk.matrix
+    return Inspection(name, figures, matrix, parameters, **about, symptoms=doctor.symptoms, findings=doctor.findings)
+
+
+def _rollout_figures(episodes: Iterable[dict[str, float]], n_steps: int) -> dict[str, float]:
     returns = [episode["r"] for episode in episodes]
-    figures["rollout/mean_return"] = float(np.mean(returns)) if returns else np.nan
-    figures["rollout/n_episodes"] = len(returns)
-    figures["rollout/n_steps"] = n_steps
-    return Inspection(name, figures, ntk.matrix, parameters)
+    return {
+        "rollout/mean_return": float(np.mean(returns)) if returns else np.nan,
+        "rollout/n_episodes": len(returns),
+        "rollout/n_steps": n_steps,
+    }
 
 
-def _check_model(model: BaseAlgorithm) -> None:
-    if not has_ntk(model):
-        raise TypeError(
-            "Models of on-policy algorithms without recurrent networks, DQN and QRDQN can be inspected, got one of "
-            f"{type(model).__name__}. For others, give ChurnMonitor and NetworkHealth to learn()"
-        )
+def _roll_out(model: BaseAlgorithm, n_steps: int) -> tuple[Symptoms, dict[str, float]]:
+    """Without training, and so without what only training shows."""
+    env = model.env
+    assert env is not None
+    observations, episodes, seen = env.reset(), [], []
+    for _ in range(-(-n_steps // env.num_envs)):
+        seen.append(np.array(observations))
+        actions, _ = model.predict(observations)  # type: ignore[arg-type]
+        observations, _, _, infos = env.step(actions)
+        episodes += [info["episode"] for info in infos if "episode" in info]
+    with unchanged_random_state():
+        batch = {"observations": obs_as_tensor(np.concatenate(seen), model.device)}
+        return symptoms_of(model, batch), _rollout_figures(episodes, len(seen) * env.num_envs)
+
+
+def _check_env(model: BaseAlgorithm) -> None:
     if model.env is None:
         name = type(model).__name__
         raise ValueError(
             f"The model has no environment: load it with one, {name}.load(path, env), or give it one by set_env(env)"
         )
-    for name, parameter in uncompiled(model.policy).named_parameters():
-        if not parameter.isfinite().all():
-            raise ValueError(f"The model cannot act: its parameter {name} has entries that are infinite or not a number")
-
-
-def algorithm_of(path: str | Path) -> type[BaseAlgorithm]:
-    """
-    :param path: A model that was saved by PPO, DQN, or an algorithm of this package
-    :return: The algorithm's class. SB3 does not save it, so it is told from the data that it saves.
-    :raises ValueError: When it is of another algorithm, or no model
-    """
-    data, *_ = load_from_zip_file(path, device="cpu")
-    policy_class = (data or {}).get("policy_class")
-    if data is None or not inspect.isclass(policy_class):
-        raise ValueError(f"{path} is not a model saved by Stable-Baselines3: it does not name its policy")
-    if policy_class.__module__.startswith("sb3_contrib"):
-        pass  # RecurrentPPO's policy is an ActorCriticPolicy
-    elif issubclass(policy_class, DQNPolicy):
-        return CChainDQN if "churn_coef" in data else DoubleDQN if "double_q" in data else DQN
-    elif issubclass(policy_class, ActorCriticPolicy) and "clip_range" in data:
-        return CChainPPO if "churn_coef" in data else PPO
-    raise ValueError(f"{path} was saved by neither PPO nor DQN (its policy is a {policy_class.__name__}): give its --algo")
 
 
 def report(inspections: Sequence[Inspection]) -> list[Table]:
@@ -187,7 +219,20 @@ def report(inspections: Sequence[Inspection]) -> list[Table]:
     tables.append(_table("Groups of layers", inspections, rows))
     if len(inspections) == 2:
         tables.append(_distances(*inspections))
-    return tables
+    return [table for table in tables if table.row_count]
+
+
+def findings_text(inspection: Inspection) -> str:
+    """
+    :param inspection: Of a model
+    :return: Its findings, with the code of what to try
+    """
+    lines = [f"{inspection.name}: {len(inspection.findings) or 'no'} finding{'' if len(inspection.findings) == 1 else 's'}"]
+    for finding in inspection.findings:
+        lines += ["", f"{finding.check.title} ({finding.check.certainty}: {finding.check.name})", f"  {finding.measured()}"]
+        for remedy in finding.remedies:
+            lines += [f"  Try {remedy.title}:", *(f"      {line}" for line in remedy.line.splitlines())]
+    return "\n".join(lines)
 
 
 def _distances(a: Inspection, b: Inspection) -> Table:
@@ -234,12 +279,12 @@ def _table(title: str, inspections: Sequence[Inspection], rows: dict[str, str]) 
     return table
 
 
-def plot(inspections: Sequence[Inspection], path: Path) -> None:
+def draw(inspections: Sequence[Inspection]) -> "Figure":
     """
     Draw the NTKs, and the figures of each group of layers.
 
     :param inspections: Of one model, or of two to compare
-    :param path: PNG file
+    :return: The picture
     :raises ImportError: Without matplotlib
     """
     tags = [tag for tag in _tags(inspections, "health/") if tag.count("/") > 1]
@@ -251,7 +296,18 @@ def plot(inspections: Sequence[Inspection], path: Path) -> None:
         for name in GROUP_FIGURES
         if any(tag.startswith(f"health/{name}/") for tag in tags)
     }
-    ntks = [(i.ntk, f"{i.name}: NTK, srank {i.figures['ntk/srank']:.0f}") for i in inspections]
-    figure = plot_models([inspection.name for inspection in inspections], ntks, groups, bars)
+    ntks = [(i.ntk, f"{i.name}: NTK, srank {i.figures['ntk/srank']:.0f}") for i in inspections if i.ntk is not None]
+    return plot_models([inspection.name for inspection in inspections], ntks, groups, bars)
+
+
+def plot(inspections: Sequence[Inspection], path: Path) -> None:
+    """
+    Save the picture of :func:`draw`.
+
+    :param inspections: Of one model, or of two to compare
+    :param path: PNG file
+    :raises ImportError: Without matplotlib
+    """
+    figure = draw(inspections)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

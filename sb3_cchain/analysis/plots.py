@@ -64,10 +64,10 @@ def plot_models(
     bars: Mapping[str, Sequence[Sequence[float]]],
 ) -> Figure:
     """
-    Draw the NTKs of one model or two, and bars for each group of their layers.
+    Draw the NTKs of one model or two, where there are any, and bars for each group of their layers.
 
     :param names: Names of the models
-    :param ntks: For each model its NTK and the title of that picture
+    :param ntks: For each model that has one, its NTK and the title of that picture
     :param groups: Names of the groups of layers
     :param bars: By title, for each model a value of each group; not a number where there is none
     :return: The picture
@@ -75,14 +75,15 @@ def plot_models(
     """
     matplotlib = import_matplotlib()
     with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
-        heights = [4.4, 1.2 + 0.3 * len(groups) * len(names)]
+        heights = [*([4.4] if ntks else []), 1.2 + 0.3 * len(groups) * len(names)]
         figure: Figure = matplotlib.figure.Figure(figsize=(11, sum(heights)), dpi=100, layout="constrained")
-        above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights).flat
-        for axes, ntk in zip(above.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
-            if ntk is None:
-                axes.axis("off")
-            else:
-                above.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
+        *above, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
+        for part in above:
+            for axes, ntk in zip(part.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
+                if ntk is None:
+                    axes.axis("off")
+                else:
+                    part.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
         height = 0.8 / len(names)
         all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False).flat
         for axes, (title, values) in zip(all_axes, bars.items(), strict=True):
@@ -92,6 +93,8 @@ def plot_models(
             axes.set_title(title, fontsize=10)
             axes.spines[["top", "right"]].set_visible(False)
             axes.margins(x=0.1)
+            axes.set_xlim(left=0)
+            axes.locator_params(axis="x", nbins=4)
         axes.invert_yaxis()
         if len(names) > 1:
             below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)

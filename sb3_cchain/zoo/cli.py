@@ -96,7 +96,8 @@ def run(command: str) -> None:
     # RL Zoo reads the files beside a model by a loader that runs what is in them
     with replaced(yaml, "UnsafeLoader", SettingsLoader):
         if command == "inspect":
-            zoo_inspect.main(sys.argv[2:])
+            if code := zoo_inspect.main(sys.argv[2:]):
+                sys.exit(code)
         elif command in MODULES:
             run_module(command)
         elif command == "train":
