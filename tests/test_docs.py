@@ -115,10 +115,10 @@ def test_notebook_was_run_as_a_whole(notebook):
     assert not any(output["output_type"] == "error" for cell in cells for output in cell["outputs"])
 
 
-def test_the_readme_goes_on_where_the_model_was(short_rollouts):
-    (code,) = snippets(ROOT / "README.md", "python")
+def test_the_quickstart_goes_on_where_the_model_was(short_rollouts):
     names: dict = {}
-    exec(shorten(code), names)
+    for code in snippets(ROOT / "docs" / "quickstart.md", "python"):
+        exec(shorten(code), names)
     assert names["model"].num_timesteps == 512
     assert list(short_rollouts.glob("runs/CChainPPO_1/events*")) and (short_rollouts / "acrobot.zip").exists()
 

@@ -41,11 +41,11 @@ def write_tables(tables: Mapping[str, str], folder: Path) -> None:
     Put tables between their comments.
 
     :param tables: Markdown, by name
-    :param folder: Where the pages are
+    :param folder: Where the pages are, or one page
     :raises ValueError: When a table has no place in any page; the others have been written
     """
     written = set()
-    for page in sorted(folder.rglob("*.md")):
+    for page in sorted(folder.rglob("*.md")) if folder.is_dir() else [folder]:
 
         def replace(place: re.Match[str]) -> str:
             name = place[1]

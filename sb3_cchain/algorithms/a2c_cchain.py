@@ -17,5 +17,5 @@ class CChainA2C(ChurnAlgorithm, A2C):
 
     :param args: Arguments of A2C
     :param kwargs: Keyword arguments of A2C, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

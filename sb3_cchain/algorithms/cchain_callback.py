@@ -25,7 +25,7 @@ from sb3_cchain.validation import check_bool
 class CChainCallback(FiniteCheck):
     """
     Trains a stock model of SB3 or sb3-contrib as the algorithm of this package trains that has its name, such as
-    :class:`~sb3_cchain.CChainPPO`, for instance from the YAML file of the stock ``rl_zoo3``::
+    :class:`~sb3_cchain.algorithms.CChainPPO`, for instance from the YAML file of the stock ``rl_zoo3``::
 
         callback:
           - sb3_cchain.CChainCallback:
@@ -39,7 +39,7 @@ class CChainCallback(FiniteCheck):
 
     Rewards and observations that are NaN or infinite raise a ``ValueError`` before they are trained on.
 
-    :param churn_coef: As for :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+    :param churn_coef: As for :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     :param target_churn_ratio: As for ``ChurnAlgorithm``
     :param churn_warmup: As for ``ChurnAlgorithm``
     :param churn_window: As for ``ChurnAlgorithm``
@@ -49,7 +49,7 @@ class CChainCallback(FiniteCheck):
     :param churn_component: As for ``CChainPPO``; another one than ``"full"`` is for PPO alone
     :param churn_reference: As for ``CChainPPO``; another one than ``"independent"`` is for PPO and TRPO
     :param churn_batch_size: As for ``CChainPPO``; another one than 1 is for PPO and TRPO
-    :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.make_lean`
+    :param lean: Whether the model gets lean action distributions, which it keeps: see :func:`~sb3_cchain.networks.make_lean`
     :param churn_target: As for ``ChurnAlgorithm``
     :raises ValueError: Naming the argument that is out of its range; when training starts, for one that the model's algorithm
         does not have, for a second CChainCallback in the same ``learn()``, and for one that another callback holds

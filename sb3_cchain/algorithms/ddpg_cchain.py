@@ -18,5 +18,5 @@ class CChainDDPG(ChurnAlgorithm, DDPG):
 
     :param args: Arguments of DDPG
     :param kwargs: Keyword arguments of DDPG, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

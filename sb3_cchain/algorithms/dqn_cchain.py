@@ -24,8 +24,8 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
     Paper: https://arxiv.org/abs/2506.00592 (Tang et al., ICML 2025)
 
-    It is :class:`~sb3_cchain.DoubleDQN`, which is SB3's :class:`~stable_baselines3.DQN` with all of its arguments, plus
-    λ·L_churn in the loss of each update. L_churn is the change that the previous update made to the Q-network: the mean
+    It is :class:`~sb3_cchain.algorithms.DoubleDQN`, which is SB3's :class:`~stable_baselines3.DQN` with all of its arguments,
+    plus λ·L_churn in the loss of each update. L_churn is the change that the previous update made to the Q-network: the mean
     squared change of all action values on another sample of the replay buffer than the minibatch of that update.
 
     Deviation from the code released with the paper: the reference batch is drawn, and the old outputs are computed, before

@@ -56,8 +56,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
         costs less because its outputs are needed anyway
     :param churn_batch_size: Size of a reference batch in minibatches: 2, 4 or 8 in the paper's Appendix A.1
     :param lean: Whether the policy acts without what PyTorch and SB3 do around the operations, which takes longer than a small
-        network: it gets a lean action distribution (:func:`~sb3_cchain.make_lean`), and in rollouts the layers of an MLP are
-        called by their ``forward()``, as they are in ``train()``. The results are the same, to the bit.
+        network: it gets a lean action distribution (:func:`~sb3_cchain.networks.make_lean`), and in rollouts the layers of an
+        MLP are called by their ``forward()``, as they are in ``train()``. The results are the same, to the bit.
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range; during training, for NaN or infinite rewards,
         observations and churn losses, before an update is made with them

@@ -18,5 +18,5 @@ class CChainSAC(ChurnAlgorithm, SAC):
 
     :param args: Arguments of SAC
     :param kwargs: Keyword arguments of SAC, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

@@ -18,5 +18,5 @@ class CChainTD3(ChurnAlgorithm, TD3):
 
     :param args: Arguments of TD3
     :param kwargs: Keyword arguments of TD3, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

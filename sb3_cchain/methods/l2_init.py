@@ -44,7 +44,7 @@ class L2Init(Penalty):
 
     :param params: Parameters or parameter groups
     :param lr: Learning rate
-    :param coef: c. The default is in the middle of what L2 Init's own code tries, for the sum.
+    :param coef: The factor c. The default is in the middle of what L2 Init's own code tries, for the sum.
     :param towards: ``"init"``, or ``"zero"`` for plain L2 regularisation
     :param reduction: ``"sum"`` of the squares over all entries of all parameters, or their ``"mean"``
     :param exclude_norms: Whether weights and biases of normalisations are left out of the sum and the mean. An optimiser knows

@@ -33,8 +33,8 @@ class Parseval(Penalty):
     :param params: Parameters or parameter groups
     :param lr: Learning rate
     :param n_output_layers: Number of weight matrices at the end that are left alone
-    :param coef: c. The paper's code has 1e-3 (Gridworld, MetaWorld) or 1e-4 (Lunar Lander, Quadruped) for layers of 64 units,
-        times (64 / units)² for others: 6.25e-5 for 256.
+    :param coef: The factor c. The paper's code has 1e-3 (Gridworld, MetaWorld) or 1e-4 (Lunar Lander, Quadruped) for layers
+        of 64 units, times (64 / units)² for others: 6.25e-5 for 256.
     :param scale: s, the squared norm of the rows. The paper's 2 is that of PPO's orthogonal initialisation with gain √2.
     :param kwargs: ``base_class`` and ``base_kwargs``, as for :class:`~sb3_cchain.methods.OptimizerWrapper`
     :raises ValueError: Naming the argument that is out of its range

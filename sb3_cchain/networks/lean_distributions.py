@@ -270,7 +270,7 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     SB3's categorical, multi-categorical, Bernoulli and diagonal Gaussian ones (gSDE, the maskable ones of sb3-contrib).
 
     An action is never drawn from NaN, as with torch's distributions. Where it came from is said by a
-    :class:`~sb3_cchain.FiniteCheck` among the callbacks, which looks at the policy once per rollout.
+    :class:`~sb3_cchain.algorithms.FiniteCheck` among the callbacks, which looks at the policy once per rollout.
 
     :param model: A model of any on-policy algorithm
     :return: The same model

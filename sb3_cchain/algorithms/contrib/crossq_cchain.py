@@ -18,5 +18,5 @@ class CChainCrossQ(ChurnAlgorithm, CrossQ):
 
     :param args: Arguments of CrossQ
     :param kwargs: Keyword arguments of CrossQ, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

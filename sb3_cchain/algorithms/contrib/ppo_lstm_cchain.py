@@ -17,5 +17,5 @@ class CChainRecurrentPPO(ChurnAlgorithm, RecurrentPPO):
 
     :param args: Arguments of RecurrentPPO
     :param kwargs: Keyword arguments of RecurrentPPO, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

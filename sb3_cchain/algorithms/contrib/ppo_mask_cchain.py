@@ -17,5 +17,5 @@ class CChainMaskablePPO(ChurnAlgorithm, MaskablePPO):
 
     :param args: Arguments of MaskablePPO
     :param kwargs: Keyword arguments of MaskablePPO, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

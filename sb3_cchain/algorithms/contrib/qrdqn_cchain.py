@@ -17,5 +17,5 @@ class CChainQRDQN(ChurnAlgorithm, QRDQN):
 
     :param args: Arguments of QRDQN
     :param kwargs: Keyword arguments of QRDQN, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

@@ -18,5 +18,5 @@ class CChainTQC(ChurnAlgorithm, TQC):
 
     :param args: Arguments of TQC
     :param kwargs: Keyword arguments of TQC, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

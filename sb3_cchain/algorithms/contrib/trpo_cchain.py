@@ -17,5 +17,5 @@ class CChainTRPO(ChurnAlgorithm, TRPO):
 
     :param args: Arguments of TRPO
     :param kwargs: Keyword arguments of TRPO, and the arguments for churn reduction:
-        :class:`~sb3_cchain.algorithms.churn_algorithm.ChurnAlgorithm`
+        :class:`~sb3_cchain.algorithms.ChurnAlgorithm`
     """

@@ -1,0 +1,136 @@
+"""
+The table and the picture of the README, from the committed results of Gym Control. Trains nothing.
+
+    python -m benchmarks.run --suite gym_control --budget reduced --method cchain vanilla oracle --seeds 2   # makes the runs
+    python -m benchmarks.readme            # prints the table
+    python -m benchmarks.readme --write    # table and picture, into the README
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.grid.results import Result, read_results
+from benchmarks.grid.run import ROOT, short_name
+from benchmarks.grid.suites import SUITES
+from benchmarks.report.cells import Cell, Cells, make_cells
+from benchmarks.report.figures import smoothed
+from benchmarks.report.markdown import markdown_table
+from benchmarks.report.paper import read_tables
+from benchmarks.report.tables import method_label
+from benchmarks.speed.tables import write_tables
+from sb3_cchain.analysis.plots import import_matplotlib
+
+SUITE, BUDGET = "gym_control", "reduced"
+METHODS = ("oracle", "vanilla", "cchain")
+
+# A policy has collapsed where the mean return of the last ten rollouts of a task is below this. Tasks end either far below or
+# far above (docs/results/gym_control.md). Not in MountainCar, where a policy that has not found the goal yet looks the same
+COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Continual/LunarLander-v3": -300}
+
+# The picture: an environment where PPO collapses with both seeds
+PICTURED = "Continual/LunarLander-v3"
+PICTURE = ROOT / "docs/images/loss_of_plasticity.png"
+TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: goes on learning"}
+
+
+def read_cells(results: Path) -> Cells:
+    """
+    :param results: Folder of all results
+    :return: The runs of the README, by environment id and method
+    """
+    found, _ = read_results(results / BUDGET / SUITE)
+    cells, _ = make_cells([result for result in found if result.line in METHODS])
+    return cells
+
+
+def collapses(results: Sequence[Result]) -> tuple[int, int]:
+    """
+    :param results: Runs in environments of ``COLLAPSED``
+    :return: Tasks after a switch at whose end the policy has collapsed, and tasks after a switch
+    """
+    ends = [
+        result.returns_in_task(task)[1][-10:].mean() < COLLAPSED[result.env_id]
+        for result in results
+        for task in range(1, result.n_tasks)
+    ]
+    return sum(ends), len(ends)
+
+
+def readme_table(cells: Cells) -> str:
+    """
+    :param cells: The runs, by environment id and method
+    :return: J(T) in each environment, here and in the paper, and how many tasks end in a collapse
+    """
+    paper = read_tables()[SUITE]
+    rows = []
+    for env_id in SUITES[SUITE].env_ids:
+        here = [cells[env_id, method] for method in METHODS]
+        figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
+        lengths = f"{here[0].results[0].n_tasks} × {here[0].results[0].steps_per_task // 1000} 000"
+        seeds = ", ".join(sorted({" ".join(map(str, cell.seeds)) for cell in here}))
+        printed = [f"{figure.mean:.0f} ± {figure.standard_error:.0f}" for figure in figures]
+        rows.append([short_name(env_id), lengths, seeds, *map(_score, here), *printed])
+    labels = [method_label(SUITE, method) for method in METHODS]
+    header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
+    counts = {
+        method: collapses([result for env_id in COLLAPSED for result in cells[env_id, method].results])
+        for method in ("vanilla", "cchain")
+    }
+    (ppo, n_tasks), (cchain, _) = counts["vanilla"], counts["cchain"]
+    names = ", ".join(short_name(env_id).split("-")[0] for env_id in COLLAPSED)
+    sentence = f"{names}: of {n_tasks} tasks after a switch, PPO has collapsed at the end of {ppo}, C-CHAIN PPO of {cchain}."
+    return f"{markdown_table(header, rows)}\n\n{sentence}"
+
+
+def _score(cell: Cell) -> str:
+    return f"{cell.mean:.0f}" if cell.error is None else f"{cell.mean:.0f} ± {cell.error:.0f}"
+
+
+def plot(cells: Cells, path: Path) -> None:
+    """
+    Draw the learning curves of PPO and of C-CHAIN PPO beside each other, a line for each seed.
+
+    :param cells: The runs, by environment id and method
+    :param path: PNG file
+    """
+    matplotlib = import_matplotlib()
+    figure = matplotlib.figure.Figure(figsize=(10, 3.8), layout="constrained")
+    panels = figure.subplots(1, len(TITLES), sharey=True)
+    for panel, (method, title) in zip(panels, TITLES.items(), strict=True):
+        results = cells[PICTURED, method].results
+        for index, result in enumerate(results):
+            for task in range(result.n_tasks):
+                steps, returns = result.returns_in_task(task)
+                label = None if task else f"seed {result.seed}"
+                panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=label)
+        for end in results[0].task_boundaries[:-1]:
+            panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
+        panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
+        panel.set_title(title, fontweight="bold")
+        panel.set_xlabel("environment steps; the world changes at the dashed lines")
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("return per episode")
+    panels[-1].legend(loc="lower right", framealpha=1, edgecolor="white")
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    :param arguments: Arguments of the command line
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of all results")
+    parser.add_argument("--write", action="store_true", help="Put table and picture into the README")
+    args = parser.parse_args(arguments)
+    cells = read_cells(args.results)
+    table = readme_table(cells)
+    print(table)
+    if args.write:
+        write_tables({"readme": table}, ROOT / "README.md")
+        plot(cells, PICTURE)
+
+
+if __name__ == "__main__":
+    main()
