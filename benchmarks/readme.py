@@ -31,7 +31,7 @@ COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Contin
 # The picture: an environment where PPO collapses with both seeds
 PICTURED = "Continual/LunarLander-v3"
 PICTURE = ROOT / "docs/images/loss_of_plasticity.png"
-TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: goes on learning"}
+TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: recovers, with one exception"}
 
 
 def read_cells(results: Path) -> Cells:
