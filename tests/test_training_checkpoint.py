@@ -549,6 +549,15 @@ def test_other_versions(path):
         assert go_on(path).num_timesteps == STEPS
 
 
+def test_a_later_numpy(path):
+    versions = find_checkpoint(path).info["versions"]
+    change_info(step(path, NEWEST), versions={**versions, "numpy": "99.1.0"})
+    with pytest.raises(
+        ValueError, match=r"was made with NumPy 99\.1\.0, .* NumPy \S+ cannot read: go on with NumPy 99 or later"
+    ):
+        go_on(path)
+
+
 # --- Another training than the one that was saved ------------------------------------------------------------------------
 
 

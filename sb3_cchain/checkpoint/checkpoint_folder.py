@@ -18,6 +18,8 @@ from pathlib import Path
 from platform import python_version
 from typing import Any, TextIO
 
+import numpy as np
+
 from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.files import check_path, check_writable, sync_folder, write_safely
 from sb3_cchain.locked_file import open_locked
@@ -90,6 +92,17 @@ class Checkpoint:
                 f"{self.path / STATE} cannot be read ({error}): it was made with other code, sb3-cchain {made_with}"
             ) from error
         return state
+
+    def check_numpy(self) -> None:
+        """
+        :raises ValueError: When it was made with a later major version of NumPy, whose pickles the installed one cannot read
+        """
+        made_with = self.info["versions"].get("numpy", "0")
+        if _major(made_with) > _major(np.__version__):
+            raise ValueError(
+                f"{self.path} was made with NumPy {made_with}, whose arrays and generators NumPy {np.__version__} cannot read: "
+                f"go on with NumPy {_major(made_with)} or later"
+            )
 
     def warn_of_other_versions(self) -> None:
         """Warn when it was made by other versions than those that are installed: results may differ then."""
@@ -266,6 +279,10 @@ def step_name(num_timesteps: int) -> str:
     :return: Name of the checkpoint's folder
     """
     return f"step_{num_timesteps:012d}"
+
+
+def _major(version_number: str) -> int:
+    return int(version_number.partition(".")[0])
 
 
 def package_versions() -> dict[str, str]:

@@ -76,7 +76,9 @@ def load_model(checkpoint: Checkpoint, env: GymEnv, device: th.device | str = "a
     :param env: The environment to go on in
     :param device: PyTorch device
     :return: The model, as Stable-Baselines3 loads it
+    :raises ValueError: When the installed NumPy cannot read it
     """
+    checkpoint.check_numpy()
     module, name = checkpoint.info["algorithm"].split(":")
     algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
     return algorithm.load(checkpoint.model_path, env, device)
