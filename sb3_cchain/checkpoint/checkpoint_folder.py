@@ -100,7 +100,7 @@ class Checkpoint:
         made_with = self.info["versions"].get("numpy", "0")
         if _major(made_with) > _major(np.__version__):
             raise ValueError(
-                f"{self.path} was made with NumPy {made_with}, whose arrays and generators NumPy {np.__version__} cannot read: "
+                f"{self.path} was made with NumPy {made_with}, whose pickles NumPy {np.__version__} cannot read: "
                 f"go on with NumPy {_major(made_with)} or later"
             )
 
