@@ -91,8 +91,7 @@ def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, 
     assert differ(seam, plain)  # the term makes a difference
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-@pytest.mark.parametrize("target_kl", [None, 0.0005])
+@pytest.mark.parametrize("env_id, target_kl", [("CartPole-v1", None), ("Pendulum-v1", 0.0005)])
 @each_reference
 def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, target_kl, churn_reference, churn_batch_size):
     settings = dict(PPO_SETTINGS, target_kl=target_kl)
