@@ -133,7 +133,8 @@ def write_best(found: Sequence[tuple[str, Best]], path: Path) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for suite, best in found:
-            values = best.beta, best.mean(best.beta), best.shipped, best.mean(best.shipped)
+            means = ["" if mean is None else round(mean, 3) for mean in map(best.mean, (best.beta, best.shipped))]
+            values = best.beta, means[0], best.shipped, means[1]
             betas, seeds = " ".join(best.cells), " ".join(map(str, best.seeds))
             writer.writerow([suite, best.env_id, best.method, betas, seeds, *values])
 

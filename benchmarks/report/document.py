@@ -316,7 +316,7 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
         f"{len(results)} runs, {hours:.1f} hours of them in total. The `run.json` of each holds its command, "
         "versions and commit, too.",
         "\n".join(counted),
-        "The same command makes those that are missing:",
+        "These commands make the runs of this page, and the page:",
         "```bash\n" + "\n".join(commands) + "\n```",
     ]
     if left_out:

@@ -19,7 +19,8 @@ WORDS = f"""\
 
 - **{AGREES}**: at least {ENOUGH_SEEDS} seeds of the paper's length, and their 95 % interval overlaps the paper's mean ± 2
   standard errors. **{DISAGREES}**: as many, and it does not. Overlap is a mild test; wide intervals agree easily.
-- **{TOO_FEW}**: fewer seeds, or another length than the paper's. Such a cell never agrees or disagrees, however close it is.
+- **{TOO_FEW}**: fewer seeds, or another length than the paper's. Such a cell never agrees or disagrees, however close it
+  is.
 - What is compared is J(T) as the released code of the paper scores it, where the runs logged that (Gym Control), else J(T) of
   finished episodes. The paper's C-CHAIN, weight clipping and L2 Init are the best of several coefficients in Gym Control and
   ProcGen, those here have one."""

@@ -89,6 +89,8 @@ def signs_table(cells: Cells, paper: Table, cchain: str, digits: int) -> str:
         printed = difference(*(Sample(figure.mean, figure.standard_error, paper.n_seeds) for figure in figures))
         seeds = f"{len(churn.seeds)} − {len(vanilla.seeds)}"
         row = [short_name(env_id), seeds, *difference_cells(here, digits), *difference_cells(printed, digits)]
+        if 1 in (len(churn.seeds), len(vanilla.seeds)):
+            row[3] = "none: one seed"
         rows.append([*row, sign_words(here, printed)])
     columns = ["95 % interval", "effect size"]
     header = ["C-CHAIN − Vanilla", "seeds", "here", *columns, "paper", *columns, "sign"]
