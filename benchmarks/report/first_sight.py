@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, budget_length
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, lines_in_order, short_name
+from benchmarks.grid.run import Run, lines_in_order, shipped_hyperparameters, short_name, split_line, suite_methods
 from benchmarks.grid.suites import SUITES
+from benchmarks.report.best_of import PAPER_BETAS
 from benchmarks.report.cells import Cells, versions_text
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.paper import AGGREGATE, Table
@@ -84,21 +85,24 @@ def versions_list(suite: str, results: Sequence[Result]) -> str:
     return "\n".join(lines)
 
 
-def missing_runs(suite: str, results: Sequence[Result], paper: Table, budget: str) -> list[Run]:
+def missing_runs(
+    suite: str, results: Sequence[Result], paper: Table, budget: str, lines: Sequence[str] | None = None
+) -> list[Run]:
     """
     :param suite: Name of the suite
     :param results: Its runs
     :param paper: The paper's table
     :param budget: One of ``BUDGETS``
-    :return: The runs of the paper's cells that are not there
+    :param lines: Methods, also with another β; by default those of the paper's table
+    :return: Those of their runs that are not there
     """
     done = {(run.env_id, run.line, run.seed) for run in results}
     return [
-        Run(suite, env_id, method, seed, *budget_length(suite, length, budget), budget)
+        Run(suite, env_id, split_line(line)[0], seed, *budget_length(suite, length, budget), budget, variant=line)
         for env_id, length in paper.lengths.items()
-        for method in paper.methods
+        for line in lines or paper.methods
         for seed in range(N_SEEDS.get(budget, paper.n_seeds))
-        if (env_id, method, seed) not in done
+        if (env_id, line, seed) not in done
     ]
 
 
@@ -131,6 +135,9 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
     ]
     if missing:
         parts.append(markdown_table(["core-hours", *map(code, paper.methods)], rows))
+    if betas := other_betas(suite):
+        hours = sum(map(rates.seconds, missing_runs(suite, results, paper, budget, betas))) / 3600
+        lines.append(f"{command} --method {' '.join(betas)}    # for the best of β: {hours:,.1f} core-hours")
     if budget != "paper":
         whole = [
             Run(suite, env_id, method, 0, *length, "paper")
@@ -141,6 +148,16 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
         command = f"python -m benchmarks.run --suite {suite} --budget paper --seeds {ENOUGH_SEEDS}"
         lines.append(f"{command}    # for verdicts: {hours:,.0f} core-hours in all")
     return [*parts, "```bash\n" + "\n".join(lines) + "\n```"]
+
+
+def other_betas(suite: str) -> list[str]:
+    """
+    :param suite: Name of the suite
+    :return: C-CHAIN with each of the paper's β but the shipped one
+    """
+    shipped = shipped_hyperparameters(suite_methods(suite)["cchain"].algo, SUITES[suite].env_ids[0]) or {}
+    betas = PAPER_BETAS.get(suite, ())
+    return [f"cchain@{beta}" for beta in betas if float(beta) != shipped.get("target_churn_ratio")]
 
 
 def _hours(hours: Sequence[float]) -> str:

@@ -33,8 +33,8 @@ Normalised by the Oracle, as in the paper's figure: J(T) over the mean of {oracl
 are made from the means of its table, so they have neither seeds nor intervals, and no IQM, which is over runs."""
 
 NO_ORACLE = """\
-The paper's figure of these metrics normalises by the Oracle. That has no meaning here, where the Oracle's returns are not all
-greater than 0."""
+The paper's figure of these metrics normalises by the Oracle. In this suite that has no meaning: there is no Oracle whose
+returns are greater than 0 in all environments."""
 
 
 def reliable_section(suite: str, cells: Cells, paper: Table, pictures: Pictures) -> list[str]:
@@ -71,12 +71,12 @@ def paper_over_oracle(paper: Table, env_ids: Sequence[str]) -> dict[str, np.ndar
     """
     :param paper: The paper's table
     :param env_ids: Some of its environments
-    :return: The mean of each method over that of the Oracle, ``(n_environments,)``; nothing where the Oracle's means are not
-        all greater than 0
+    :return: The mean of each method over that of the Oracle, ``(n_environments,)``; nothing in a suite where
+        the Oracle's means are not all greater than 0
     """
-    means = [paper.means(env_id) for env_id in env_ids]
-    if not all(mean.get("oracle", 0) > 0 for mean in means):
+    if not all(paper.means(env_id).get("oracle", 0) > 0 for env_id in paper.lengths):
         return {}
+    means = [paper.means(env_id) for env_id in env_ids]
     return {method: np.array([mean[method] / mean["oracle"] for mean in means]) for method in paper.methods}
 
 
