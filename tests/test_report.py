@@ -7,31 +7,39 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from benchmarks.grid.results import Result, read_results, write_result
+from benchmarks.grid.results import WITH_CUT, Result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run, as_json, paper_methods, shipped_hyperparameters, suite_methods
 from benchmarks.grid.suites import SUITES, paper_length
 from benchmarks.report.__main__ import main
+from benchmarks.report.best_of import best_betas, best_table, write_best
 from benchmarks.report.cells import make_cells
 from benchmarks.report.continual_table import continual_table
 from benchmarks.report.document import write_report
 from benchmarks.report.estimates import (
+    Difference,
     agrees,
     best_two,
     bootstrap_interval,
+    difference,
     mean_and_error,
     normalized,
     probability_of_improvement,
     reliable_metrics,
+    sample,
 )
 from benchmarks.report.figures import band, plot_learning_curves, plot_quantities, smoothed
+from benchmarks.report.first_sight import missing_runs, missing_section
 from benchmarks.report.markdown import code, escaped
 from benchmarks.report.page import html_page
 from benchmarks.report.paper import read_tables
 from benchmarks.report.quantities import NTK, PLASTICITY, RETURNS, Quantity
 from benchmarks.report.random_policy import TaskLook
+from benchmarks.report.reliable import paper_over_oracle
 from benchmarks.report.tables import aggregates, mark_differences, results_table, score_matrices
 from benchmarks.report.task_tables import average_cells, cost_table, mean_rows, quantities_table, returns_header, returns_rows
+from benchmarks.report.verdicts import sign_words, signs_table, verdict_words, verdicts_table
 
 ACROBOT, CARTPOLE = "Continual/Acrobot-v1", "Continual/CartPole-v1"
 VERSIONS = {"torch": "2.8.0", "gymnasium": "1.2.0"}
@@ -45,9 +53,9 @@ def few_resamples(monkeypatch):
 @pytest.fixture
 def no_drawing(monkeypatch):
     """For tests of the text alone."""
-    for name in ("plot_learning_curves", "plot_quantities", "plot_reliable_metrics"):
+    for name in ("document.plot_learning_curves", "document.plot_quantities", "reliable.plot_reliable_metrics"):
         monkeypatch.setattr(
-            f"benchmarks.report.document.{name}",
+            f"benchmarks.report.{name}",
             lambda *arguments: [path.write_bytes(b"png") for path in arguments if isinstance(path, Path)],
         )
 
@@ -267,7 +275,7 @@ def test_table_by_hand(tmp_path):
     assert rows[:6] == [
         ["J(T)", "", "Oracle", "PPO", "TRAC", "Weight clipping", "L2 Init", "C-CHAIN PPO"],
         ["---"] * 8,
-        ["Acrobot-v1", "here", "-1.5", "-350.0", "<ins>-215.0 ± 15.0</ins> ✗ †", "–", "–", "**-115.0 ± 15.0** ✓"],
+        ["Acrobot-v1", "here", "-1.5", "-350.0", "<ins>-215.0 ± 15.0</ins> †", "–", "–", "**-115.0 ± 15.0**"],
         ["", "95 % interval", "–", "–", "[-230.0, -200.0]", "–", "–", "[-130.0, -100.0]"],
         [
             *("", "paper", "-125.7 ± 8.3", "-372.7 ± 3.3", "-166.6 ± 8.9", "**-118.8 ± 13.4**"),
@@ -521,7 +529,7 @@ def test_whole_report(whole_report):
     text, page, folder, results = whole_report
     assert "budget `smoke`" in text and "9 finished runs of 2 seeds" in text
     assert "- Not run: Continual ProcGen, Continual DeepMind Control, Continual MinAtar." in text
-    assert "5 of the paper's 24 cells have runs. Of the 4 with more than one seed, 0 agree with the paper." in text
+    assert "Of the paper's 24 cells 0 agree, 0 disagree, 5 have not enough runs, 19 have no run." in text
     assert "| Acrobot-v1 | 2 × 100 | 10 × 160,000 |" in text and "not expected to agree" in text
     assert "Left out, because they do not have runs in all of them: Oracle, TRAC, Weight clipping, L2 Init." in text
     assert "| PPO | 1.00 [1.00, 1.00] | 2 of 2 | 2 of 2 |" in text
@@ -807,14 +815,229 @@ def test_a_picture_of_quantities_with_variants(tmp_path, monkeypatch):
     plt.close(figure)
 
 
-def test_the_committed_results_make_the_committed_report(tmp_path, monkeypatch, no_drawing):
-    """Apart from names of classes, which the report shows as they are now."""
+# Verdicts, signs, what is missing
+
+LENGTH = (10, 160_000)
+
+
+def write_long(folder, method, value, seed=0, **fields):
+    """A run of the paper's length in Acrobot, with one rollout in each task."""
+    names = [f"task {task}" for task in range(LENGTH[0])]
+    return write(
+        folder,
+        method,
+        [[value]] * LENGTH[0],
+        seed=seed,
+        n_tasks=LENGTH[0],
+        steps_per_task=LENGTH[1],
+        task_names=names,
+        **fields,
+    )
+
+
+def with_cut(value):
+    return [(LENGTH[1] * (task + 1), WITH_CUT, value) for task in range(LENGTH[0])]
+
+
+@pytest.mark.parametrize(
+    ("values", "length", "words"),
+    [
+        # The paper's C-CHAIN in Acrobot is -119.2 ± 6.9: -133.1 to -105.4
+        ([-100, -104, -106], LENGTH, "✓ agrees"),
+        ([-100, -104, -105], LENGTH, "✗ disagrees"),
+        ([-140, -150, -134], LENGTH, "✗ disagrees"),
+        ([-119, -119], LENGTH, "not enough runs: 2 seeds"),
+        ([-119], LENGTH, "not enough runs: 1 seed"),
+        ([-119, -119, -119], (4, 64_000), "not enough runs: other length"),
+    ],
+)
+def test_verdict_by_hand(tmp_path, values, length, words):
+    for seed, value in enumerate(values):
+        write_long(tmp_path, "cchain", value, seed)
+    paper = read_tables()["gym_control"]
+    cells = cells_in(tmp_path)
+    length = length if length == LENGTH else (LENGTH[0] + 1, LENGTH[1])
+    assert verdict_words(cells[ACROBOT, "cchain"], paper.figures[ACROBOT, "cchain"], length) == words
+    if length == LENGTH:
+        (row,) = [row for row in table_rows(verdicts_table(cells, paper, {"cchain": "C-CHAIN"})) if row[0] == "Acrobot-v1"]
+        assert row == ["Acrobot-v1", words]
+        cell = table_rows(results_table("gym_control", cells, paper))[2][-1]
+        assert [sign for sign in "✓✗" if sign in cell] == [sign for sign in "✓✗" if sign in words]
+
+
+def test_the_verdict_goes_by_the_rule_of_the_released_code_where_it_was_logged(tmp_path, no_drawing):
+    for seed, value in enumerate((-90, -95, -100)):
+        write_long(tmp_path, "cchain", value, seed, metrics=with_cut(value - 20))
+        write_long(tmp_path, "trac", value, seed, metrics=with_cut(value - 20) if seed else ())
+    cells, paper = cells_in(tmp_path), read_tables()["gym_control"]
+    assert cells[ACROBOT, "cchain"].scores_with_cut == (-110.0, -115.0, -120.0)
+    assert cells[ACROBOT, "trac"].scores_with_cut is None
+    assert verdict_words(cells[ACROBOT, "cchain"], paper.figures[ACROBOT, "cchain"], LENGTH) == "✓ agrees"
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    rows = table_rows((tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1])
+    both = ["0 1 2", "-95.0 ± 2.9", "-115.0 ± 2.9", "-119.2 ± 6.9", "✓ agrees"]
+    assert [row for row in rows if "Acrobot-v1, " in row[0]] == [["Acrobot-v1, C-CHAIN PPO", *both]]
+
+
+def test_difference_by_hand():
+    # Variances 4 and 2, of 3 and 2 seeds: squared errors 4/3 and 1, mean variance 3
+    value, interval, effect = difference(sample([1.0, 3.0, 5.0]), sample([0.0, 2.0]))
+    assert value == 2.0 and effect == pytest.approx(2 / 3**0.5 * (1 - 3 / 11))
+    welch = stats.ttest_ind([1.0, 3.0, 5.0], [0.0, 2.0], equal_var=False).confidence_interval(0.95)
+    assert interval == pytest.approx((welch.low, welch.high))
+
+
+@pytest.mark.parametrize(("one", "other"), [([1.0], [0.0, 2.0]), ([0.0, 2.0], [1.0]), ([1.0, 1.0], [0.0, 0.0])])
+def test_difference_without_a_spread(one, other):
+    assert difference(sample(one), sample(other)) == (np.mean(one) - np.mean(other), None, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "words"),
+    [
+        (5.0, (1.0, 9.0), "the paper's; clear of 0"),
+        (5.0, (-1.0, 11.0), "the paper's; the interval holds 0"),
+        (-5.0, (-9.0, -1.0), "**not the paper's**; clear of 0"),
+        (-5.0, None, "**not the paper's**; no interval"),
+        (0.0, None, "none: no difference"),
+    ],
+)
+def test_words_of_the_sign(value, interval, words):
+    assert sign_words(Difference(value, interval, None), Difference(3.0, (1.0, 5.0), 1.0)) == words
+
+
+def test_table_of_signs_by_hand(tmp_path):
+    write(tmp_path, "vanilla", [[-400], [-300]])
+    for seed in (0, 1):
+        write(tmp_path, "cchain", [[-100], [-90 - seed]], seed=seed)
+    (row,) = table_rows(signs_table(cells_in(tmp_path), read_tables()["gym_control"], "cchain", 1))[2:]
+    assert row[:5] == ["Acrobot-v1", "2 − 1", "+254.8", "none: one seed", "–"] and row[-1] == "the paper's; no interval"
+    # -119.211 + 372.725; squared errors 48.01 and 10.68, of 6 seeds: 7.12 degrees of freedom, a t of 2.357
+    assert row[5] == "+253.5"
+    low, high = map(float, row[6].strip("[]").split(", "))
+    assert (high - low) / 2 == pytest.approx(2.357 * 58.69**0.5, abs=0.1)
+    assert float(row[7]) == pytest.approx(253.5 / (6 * 58.69 / 2) ** 0.5 * (1 - 3 / 39), abs=0.1)
+
+
+def test_what_is_missing_by_hand(tmp_path):
+    # 200 steps an hour, and the budget has 3 seeds of 4 x 64 000 steps: 1280 hours each
+    write(tmp_path, "vanilla", [[-400], [-300]], experiment="reduced")
+    paper = read_tables()["gym_control"]
+    runs = whole_results(tmp_path)
+    assert len(missing_runs("gym_control", runs, paper, "reduced")) == 4 * 6 * 3 - 1
+    assert len(missing_runs("gym_control", runs, paper, "paper")) == 4 * 6 * 6 - 1
+    text = "\n".join(missing_section("gym_control", runs, paper, "reduced"))
+    header, _, row = table_rows(text[text.index("| core-hours") :])[:3]
+    assert row[0] == f"`{ACROBOT}`" and dict(zip(header, row, strict=True))["`vanilla`"] == "2560.0 (2 seeds)"
+    command = "python -m benchmarks.run --suite gym_control --budget"
+    assert f"{command} reduced --env {ACROBOT} --method oracle " in text and f"{command} paper --seeds 3 " in text
+    assert missing_section("gym_control", runs, paper, "a comparison") == []
+    # 3 seeds of 2 β in 4 environments, at the 510 steps a second of C-CHAIN in the suite's row
+    assert f"{command} reduced --method cchain@1e3 cchain@1e5    # for the best of β: {24 * 256_000 / 510 / 3600:.1f} " in text
+
+
+def test_nothing_is_missing_of_what_is_whole(tmp_path):
+    paper = read_tables()["minatar"]
+    for method in paper.methods:
+        for seed in range(3):
+            write(tmp_path, method, [[1], [1]], "Continual/MinAtar-v0", seed, suite="minatar", experiment="reduced")
+    text = "\n".join(missing_section("minatar", whole_results(tmp_path), paper, "reduced"))
+    assert "0 runs, 0.0 core-hours" in text and "one cell" not in text
+
+
+# Best of β
+
+
+def write_betas(folder, scores):
+    """Runs of two seeds and more of C-CHAIN in Acrobot, by β; None is the shipped one."""
+    for beta, values in scores.items():
+        line = {} if beta is None else {"variant": f"cchain@{beta}", "overrides": (f"target_churn_ratio:{beta}",)}
+        for seed, value in enumerate(values):
+            write(folder, "cchain", [[value], [value]], seed=seed, **line)
+
+
+def test_best_of_betas_by_hand(tmp_path):
+    # On the seeds that all have, 1e3 is no longer the best
+    write_betas(tmp_path, {None: [-100, -120], "1e3": [-200, -80, 0], "1e5": [-90, -90]})
+    (best,) = best_betas(cells_in(tmp_path), [ACROBOT, CARTPOLE])
+    assert (best.env_id, best.method, best.seeds) == (ACROBOT, "cchain", [0, 1])
+    assert (list(best.cells), best.beta, best.shipped) == (["1e3", "1e4", "1e5"], "1e5", "1e4")
+    row = table_rows(best_table("gym_control", [best], read_tables()["gym_control"]))[2]
+    here = ["-90.0 (best of 3: β = 1e5)", "-110.0 (β = 1e4)", "-119.2 ± 6.9"]
+    assert row == ["Acrobot-v1, C-CHAIN PPO", "1e3, 1e4, 1e5", "0 1", *here, "not enough runs: 2 seeds, other length"]
+    write_best([("gym_control", best)], tmp_path / "best_of.csv")
+    header, line = (tmp_path / "best_of.csv").read_text().splitlines()
+    assert line == f"gym_control,{ACROBOT},cchain,1e3 1e4 1e5,0 1,1e5,-90.0,1e4,-110.0"
+    assert len(header.split(",")) == len(line.split(","))
+    write_best([], tmp_path / "best_of.csv")
+    assert not (tmp_path / "best_of.csv").exists()
+
+
+def test_best_of_fewer_betas_than_the_papers_has_no_verdict(tmp_path, no_drawing):
+    write_betas(tmp_path, {"1e3": [-100, -120]})
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "| -110.0 (best of 1: β = 1e3) | – | -119.2 ± 6.9 | not enough runs: β = 1e4, 1e5 missing |" in text
+    assert "biased upwards" in text and (tmp_path / "out" / "best_of.csv").exists()
+
+
+@pytest.mark.parametrize("scores", [{None: [1, 2]}, {"1e3": [1]}])
+def test_best_of_needs_another_beta_and_seeds_in_common(tmp_path, scores):
+    write_betas(tmp_path, scores)
+    if "1e3" in scores:
+        write(tmp_path, "cchain", [[1], [1]], seed=5)
+    assert best_betas(cells_in(tmp_path), [ACROBOT]) == []
+
+
+# Normalised by the Oracle
+
+
+def test_the_papers_figure_by_the_oracle():
+    """The paper prints C-CHAIN's mean and median as 1.463 and 1.452, Vanilla's mean as 0.811."""
+    paper = read_tables()["procgen"]
+    ratios = paper_over_oracle(paper, list(paper.lengths))
+    assert (ratios["cchain"].mean(), np.median(ratios["cchain"])) == pytest.approx((1.463, 1.452), abs=5e-4)
+    assert ratios["vanilla"].mean() == pytest.approx(0.811, abs=5e-4) and ratios["oracle"].tolist() == [1.0] * 16
+    gym, minatar = read_tables()["gym_control"], read_tables()["minatar"]
+    assert paper_over_oracle(gym, [CARTPOLE]) == paper_over_oracle(minatar, list(minatar.lengths)) == {}
+
+
+@pytest.mark.parametrize(("oracle", "mean"), [(True, "0.50"), (False, None)])
+def test_metrics_by_the_oracle(tmp_path, oracle, mean, no_drawing):
+    """By its own runs or, without them, by the paper's."""
+    env_id = "Continual/BossFight-v0"
+    for seed in (0, 1):
+        for method, value in (("vanilla", 1), ("cchain", 2), *([("oracle", 4)] if oracle else [])):
+            write(tmp_path, method, [[value], [value]], env_id, seed, suite="procgen")
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text().split("Normalised by the Oracle")[1]
+    printed = read_tables()["procgen"].means(env_id)
+    expected = mean if oracle else f"{2 / printed['oracle']:.2f}"
+    assert f"| C-CHAIN PPO | 0 1 | {expected} [{expected}, {expected}] |" in text
+    ratio = f"{printed['cchain'] / printed['oracle']:.2f}"
+    assert f"| C-CHAIN PPO, paper | – | {ratio} | {ratio} | – | – |" in text
+    assert ("the paper's Oracle (it has no runs here)" in text) is not oracle
+    assert "pictures/metrics_by_oracle_procgen.png" in text
+
+
+# The committed reports
+
+
+def test_the_committed_results_make_the_committed_reports(tmp_path, monkeypatch):
+    """One command makes them from scratch, with all pictures: that a picture is the same to the bit is not asked."""
     monkeypatch.setattr("benchmarks.report.estimates.N_RESAMPLES", 2000)
-    folder = ROOT / "benchmarks" / "results" / "reduced"
-    write_report(whole_results(folder), "reduced", tmp_path)
-    before = (folder / "report.md").read_text().replace("sb3_cchain.baselines.", "sb3_cchain.methods.")
-
-    def tables(text):
-        return [line for line in text.splitlines() if line.startswith("|")]
-
-    assert tables((tmp_path / "report.md").read_text()) == tables(before)
+    committed = ROOT / "benchmarks" / "results"
+    budgets = ["reduced", "paper"]
+    options = ["--results", str(committed), "--budget", *budgets, "--output", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["report", *options])
+    main()
+    for budget in budgets:
+        made, before = tmp_path / budget, committed / budget
+        names = sorted(str(path.relative_to(made)) for path in made.rglob("*.*"))
+        for name in names:
+            assert (before / name).is_file(), name
+            if name.endswith((".md", ".csv")):
+                assert (made / name).read_text() == (before / name).read_text()
+        assert sorted(path.name for path in (before / "pictures").iterdir()) == [
+            Path(name).name for name in names if name.startswith("pictures/")
+        ]

@@ -24,10 +24,19 @@ def run_length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
     :param budget: One of ``BUDGETS``
     :return: Number of tasks, and environment steps per task
     """
-    n_tasks, steps = paper_length(env_id)
+    return budget_length(suite, paper_length(env_id), budget)
+
+
+def budget_length(suite: str, length: tuple[int, int], budget: str) -> tuple[int, int]:
+    """
+    :param suite: Name of the suite
+    :param length: The paper's number of tasks, and environment steps per task
+    :param budget: One of ``BUDGETS``
+    :return: Those of the budget
+    """
     if budget == "smoke":
         return 2, SUITES[suite].smoke_steps
-    return (n_tasks, steps) if budget == "paper" else SUITES[suite].reduce_length(n_tasks, steps)
+    return length if budget == "paper" else SUITES[suite].reduce_length(*length)
 
 
 def grid_runs(

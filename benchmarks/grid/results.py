@@ -29,7 +29,9 @@ from benchmarks.grid.run import Run, as_json, suite_methods
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 
-METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/", "continual/mean_return_with_cut")
+# The return of a rollout by the rule of the released code of Gym Control, which counts the episode that the rollout cuts
+WITH_CUT = "continual/mean_return_with_cut"
+METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/", WITH_CUT)
 METRICS_COLUMNS = ("timesteps", "name", "value")
 
 # Names that classes had in the hyperparameters of older results
@@ -113,6 +115,13 @@ class Result(Run):
         """
         averages = task_averages(self.returns)
         return [averages.get(task, math.nan) for task in range(self.n_tasks)]
+
+    def averages_with_cut(self) -> list[float]:
+        """
+        :return: As :meth:`task_averages`, of ``WITH_CUT``: NaN for a task without it
+        """
+        series = [self.metric_in_task(WITH_CUT, task)[1] for task in range(self.n_tasks)]
+        return [float(values.mean()) if len(values) else math.nan for values in series]
 
     def returns_in_task(self, task: int) -> Series:
         """

@@ -3,7 +3,10 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+
+import numpy as np
 
 from benchmarks.grid.results import Result
 from benchmarks.report.estimates import Interval, bootstrap_interval, mean_and_error
@@ -22,6 +25,17 @@ class Cell:
 
     results: tuple[Result, ...]
     scores: tuple[float, ...]
+
+    @cached_property
+    def scores_with_cut(self) -> tuple[float, ...] | None:
+        """J(T) of each by the rule of the released code (``WITH_CUT``), None unless all runs have logged it in all tasks."""
+        scores = tuple(float(np.mean(result.averages_with_cut())) for result in self.results)
+        return scores if all(map(math.isfinite, scores)) else None
+
+    @property
+    def paper_scores(self) -> tuple[float, ...]:
+        """Those to compare with the paper: by the rule of the released code where it was logged, else the scores."""
+        return self.scores_with_cut or self.scores
 
     @property
     def seeds(self) -> list[int]:

@@ -2,10 +2,8 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import (
@@ -18,28 +16,31 @@ from benchmarks.grid.run import (
     suite_methods,
 )
 from benchmarks.grid.suites import SUITES
-from benchmarks.report.cells import Cells, make_cells, versions_text
+from benchmarks.report.best_of import WORDS as BEST_WORDS
+from benchmarks.report.best_of import Best, best_betas, best_table, write_best
+from benchmarks.report.cells import Cells, make_cells
 from benchmarks.report.continual_table import WORDS as CONTINUAL_WORDS
 from benchmarks.report.continual_table import continual_table
-from benchmarks.report.estimates import METRICS, agrees, normalized, probability_of_improvement, reliable_metrics
-from benchmarks.report.figures import plot_learning_curves, plot_quantities, plot_reliable_metrics
+from benchmarks.report.estimates import mean_and_error
+from benchmarks.report.figures import plot_learning_curves, plot_quantities
+from benchmarks.report.first_sight import WORDS as FIRST_SIGHT
+from benchmarks.report.first_sight import first_sight
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.page import html_page
-from benchmarks.report.paper import AGGREGATE, Table, read_tables
+from benchmarks.report.paper import Table, read_tables
+from benchmarks.report.pictures import Pictures
 from benchmarks.report.quantities import NTK
+from benchmarks.report.reliable import reliable_section
 from benchmarks.report.tables import (
-    cchain_line,
     lengths_table,
     mark_differences,
     method_label,
     results_table,
-    score_matrices,
     table_digits,
     table_methods,
 )
 from benchmarks.report.task_tables import MISSING, quantities_table, returns_header, returns_rows, seeds_text
-
-PICTURES = "pictures"
+from benchmarks.report.verdicts import verdict_words
 
 INTRODUCTION = """# The paper's tables, reproduced: budget {budget}
 
@@ -48,8 +49,9 @@ Continual Reinforcement Learning by Reducing Churn* (Tang et al., ICML 2025). Al
 the results folder are included; the runs of a cell differ in their seed alone. The hyperparameters are those shipped when
 the runs were made; the `run.json` of each run has them.
 
-{suites}
+{suites}"""
 
+READING = """\
 ## How to read the tables
 
 - **J(T)**, what the cells hold, is the average return over the whole of learning, not that of the final policy: the mean
@@ -60,9 +62,7 @@ the runs were made; the `run.json` of each run has them.
 - The **95 % interval** is a percentile bootstrap of the mean over the seeds, 10,000 resamples. With three seeds or fewer it
   reaches from the lowest seed to the highest, and holds the true mean less often than its name says: of three seeds, in
   about three cases of four.
-- **✓** the cell agrees with the paper: the interval overlaps the paper's mean ± 2 standard errors. **✗** it does not.
-  Overlap is a mild test; wide intervals agree easily. A single seed has no ±, no interval and neither sign. Between runs of
-  different lengths neither sign says much.
+- **✓** and **✗** are the verdicts of the first section; a cell with neither has not enough runs for one.
 - In Gym Control and ProcGen the **paper's coefficients are tuned**: of C-CHAIN's β, weight clipping's κ and L2 Init's c it
   reports the best of 3, 4 and 5 values in each environment. Those here are the shipped ones, one of each for a whole suite,
   and not chosen by the runs that the tables show. They stand below each suite's table.
@@ -76,18 +76,9 @@ the runs were made; the `run.json` of each run has them.
   commits of this repository that the runs were made at are listed at the end."""
 
 
-NORMALIZATION = """\
-Scores are J(T), normalised in each environment so that 0 is the lowest and 1 the highest of the paper's means of all its
-methods, the Oracle among them: a scale that the runs here do not move. (The paper's Vanilla and Oracle would make no
-scale: they are too close together in Leaper, and in the opposite order in Quadruped.) The optimality gap is what is missing
-to 1, on average, scores above counting as 1: less is better. In brackets the 95 % interval, bootstrapped over seeds within
-each environment. An environment in which the paper's means lie close together, as in Leaper, moves the mean more than others
-do, and the IQM less."""
-
-IMPROVEMENT = """\
-The probability of improvement is that a run of C-CHAIN has a higher J(T) than one of the other method, mean over the
-environments; 0.5 says nothing either way. Beside it, in how many environments C-CHAIN's mean is the higher one, of the seeds
-of the table above."""
+RELEASED_WORDS = """\
+The released code also counts the episode that the end of a rollout cuts, with its return so far. Both scores, of the cells
+all of whose runs logged it; the other tables of this page have finished episodes alone."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
@@ -120,8 +111,7 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
     results = [result for runs in by_suite.values() for result in runs]
     if not results:
         raise ValueError("; ".join(["No run is left for the report", *left_out]))
-    pictures = _Pictures(folder)
-    sections = [_suite_section(suite, runs, tables[suite], pictures) for suite, runs in by_suite.items() if runs]
+    pictures = Pictures(folder)
     titles = {suite: SUITES[suite].title for suite in by_suite}
     contents = [f"- [{titles[suite]}](#{titles[suite].lower().replace(' ', '-')})" for suite, runs in by_suite.items() if runs]
     if missing := [titles[suite] for suite, runs in by_suite.items() if not runs]:
@@ -132,46 +122,44 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
         n_runs=len(results),
         seeds=f" of {n_seeds} seeds" if n_seeds > 1 else " of a single seed",
         suites="\n".join(contents),
-        missing=MISSING,
     )
-    markdown = "\n\n".join([introduction, *sections, _runs_section(results, experiment, left_out)]) + "\n"
+    cells_of = {suite: make_cells(runs) for suite, runs in by_suite.items() if runs}
+    found = {suite: best_betas(cells, list(tables[suite].lengths)) for suite, (cells, _) in cells_of.items()}
+    write_best([(suite, best) for suite, bests in found.items() for best in bests], folder / "best_of.csv")
+    sight = [
+        part
+        for suite, (cells, _) in cells_of.items()
+        for part in first_sight(suite, cells, by_suite[suite], tables[suite], experiment)
+    ]
+    sections = [
+        _suite_section(suite, by_suite[suite], *cells_of[suite], found[suite], tables[suite], pictures) for suite in cells_of
+    ]
+    parts = [introduction, FIRST_SIGHT, *sight, READING.format(missing=MISSING), *sections]
+    markdown = "\n\n".join([*parts, _runs_section(results, experiment, left_out)]) + "\n"
     (folder / "report.md").write_text(markdown)
     (folder / "report.html").write_text(html_page(markdown, pictures.drawn))
     return left_out
 
 
-class _Pictures:
-    """
-    The pictures of a report.
-
-    :param folder: Folder of the report
-    """
-
-    def __init__(self, folder: Path):
-        self._folder = folder
-        self.drawn: dict[str, Path] = {}
-        (folder / PICTURES).mkdir(parents=True, exist_ok=True)
-
-    def add(self, name: str, alternative: str) -> tuple[Path, str]:
-        """
-        :param name: Name of a picture that is about to be drawn
-        :param alternative: Alternative text
-        :return: Its path, and the Markdown that shows it
-        """
-        relative = f"{PICTURES}/{name}.png"
-        self.drawn[relative] = self._folder / relative
-        return self.drawn[relative], f"![{alternative}]({relative})"
-
-
-def _suite_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> str:
+def _suite_section(
+    suite: str,
+    results: Sequence[Result],
+    cells: Cells,
+    left_out: Sequence[str],
+    found: Sequence[Best],
+    paper: Table,
+    pictures: Pictures,
+) -> str:
     """The section of a suite."""
-    cells, left_out = make_cells(results)
     parts = [f"## {SUITES[suite].title}", lengths_table(results, paper), results_table(suite, cells, paper)]
     parts += _notes(suite, cells, paper, left_out)
     if marks := mark_differences(suite, paper):
         parts.append("Where the paper's own marks or sums do not follow from its numbers:\n\n" + "\n".join(marks))
     parts += _hyperparameters_section(suite, results, paper)
-    parts += _reliable_section(suite, cells, paper, pictures)
+    parts += _released_section(suite, cells, paper)
+    if found:
+        parts += ["### Best of β", BEST_WORDS, best_table(suite, found, paper)]
+    parts += reliable_section(suite, cells, paper, pictures)
     parts += _curves_section(suite, results, paper, pictures)
     parts += _continual_section(suite, results, paper)
     parts += _ntk_section(suite, results, paper, pictures)
@@ -179,15 +167,8 @@ def _suite_section(suite: str, results: Sequence[Result], paper: Table, pictures
 
 
 def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> list[str]:
-    """How many cells there are, how many agree with the paper, and what readers should know about them."""
-    wanted = {key: figure for key, figure in paper.figures.items() if key[0] != AGGREGATE}
-    there = {key: cells[key].interval for key in wanted if key in cells}
-    tested = {key: interval for key, interval in there.items() if interval is not None}
-    n_agree = sum(agrees(interval, wanted[key].mean, wanted[key].standard_error) for key, interval in tested.items())
-    notes = [
-        f"{len(there)} of the paper's {len(wanted)} cells have runs. Of the {len(tested)} with more than one seed, "
-        f"{n_agree} agree with the paper."
-    ]
+    """What readers should know about the cells."""
+    notes = []
     different = [
         f"- † {short_name(env_id)}, {method_label(suite, method)}: "
         + "; ".join(f"seeds {seeds_text(seeds)} with {escaped(versions)}" for versions, seeds in cell.versions)
@@ -214,6 +195,30 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
             "Left out, because their J(T) is not defined:\n\n" + "\n".join(f"- {escaped(reason)}" for reason in left_out)
         )
     return notes
+
+
+def _released_section(suite: str, cells: Cells, paper: Table) -> list[str]:
+    """J(T) by both rules, of the cells whose runs logged that of the released code."""
+    digits = table_digits(paper)
+    rows = []
+    for env_id, length in paper.lengths.items():
+        for method in table_methods(cells, paper):
+            cell, figure = cells.get((env_id, method)), paper.figures.get((env_id, method))
+            if cell is None or cell.scores_with_cut is None:
+                continue
+            both = [_score(*mean_and_error(scores), digits) for scores in (cell.scores, cell.scores_with_cut)]
+            printed = [MISSING, MISSING]
+            if figure is not None:
+                printed = [_score(figure.mean, figure.standard_error, digits), verdict_words(cell, figure, length)]
+            rows.append([f"{short_name(env_id)}, {method_label(suite, method)}", seeds_text(cell.seeds), *both, *printed])
+    if not rows:
+        return []
+    header = ["J(T)", "seeds", "finished episodes", "with the cut one", "paper", "verdict, with the cut one"]
+    return ["### By the rule of the released code", RELEASED_WORDS, markdown_table(header, rows)]
+
+
+def _score(mean: float, error: float | None, digits: int) -> str:
+    return f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
 
 
 def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:
@@ -243,77 +248,7 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
     return parts
 
 
-def _reliable_section(suite: str, cells: Cells, paper: Table, pictures: _Pictures) -> list[str]:
-    """rliable's metrics over the environments."""
-    env_ids, scores, seeds = score_matrices(cells, paper)
-    cchain = cchain_line(cells)
-    if not {"vanilla", cchain} <= set(scores):
-        return []
-    low, high = (np.array([end(paper.means(env_id).values()) for env_id in env_ids]) for end in (min, max))
-    estimates, intervals = reliable_metrics({method: normalized(matrix, low, high) for method, matrix in scores.items()})
-    several = [method for method in scores if len(seeds[method]) > 1]
-
-    rows = []
-    for method, values in estimates.items():
-        figures = [f"{value:.2f}" for value in values]
-        if method in several:
-            figures = [f"{figure} [{lo:.2f}, {hi:.2f}]" for figure, lo, hi in zip(figures, *intervals[method], strict=True)]
-        rows.append([method_label(suite, method), seeds_text(seeds[method]), *figures])
-    without = [method_label(suite, method) for method in table_methods(cells, paper) if method not in scores]
-    words = [
-        f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and {cchain_words(suite, cchain)} both have runs. "
-        + (f"Left out, because they do not have runs in all of them: {', '.join(without)}. " if without else "")
-        + NORMALIZATION
-    ]
-    shown = []
-    if several:
-        path, picture = pictures.add(f"metrics_{suite}", f"Metrics over the environments of {SUITES[suite].title}")
-        plot_reliable_metrics(
-            {name: estimates[name] for name in several}, intervals, list(METRICS), suite_lines(suite, several), path
-        )
-        shown = [picture]
-    header = ["method", "seeds", *METRICS]
-    return [
-        "### Over the environments",
-        *words,
-        markdown_table(header, rows),
-        *shown,
-        *_improvement(suite, env_ids, cchain, scores, several, paper),
-    ]
-
-
-def cchain_words(suite: str, line: str) -> str:
-    """
-    :param suite: Name of a suite
-    :param line: C-CHAIN, or C-CHAIN with another β
-    :return: How the text calls it
-    """
-    return "C-CHAIN" if line == "cchain" else method_label(suite, line)
-
-
-def _improvement(
-    suite: str, env_ids: Sequence[str], cchain: str, scores: Mapping[str, np.ndarray], several: Sequence[str], paper: Table
-) -> list[str]:
-    """C-CHAIN against each other method."""
-    rows = []
-    for method, (probability, interval) in probability_of_improvement(scores, cchain).items():
-        text = f"{probability:.2f}"
-        if method in several and cchain in several:
-            text += f" [{interval[0]:.2f}, {interval[1]:.2f}]"
-        higher = int((scores[cchain].mean(axis=0) > scores[method].mean(axis=0)).sum())
-        in_paper = MISSING
-        if method in paper.methods:
-            means = [paper.means(env_id) for env_id in env_ids]
-            in_paper = f"{sum(mean['cchain'] > mean[method] for mean in means)} of {len(env_ids)}"
-        rows.append([method_label(suite, method), text, f"{higher} of {len(env_ids)}", in_paper])
-    header = [f"{cchain_words(suite, cchain)} over", "probability of improvement", "higher mean, here", "higher mean, paper"]
-    return [
-        IMPROVEMENT,
-        markdown_table(header, rows),
-    ]
-
-
-def _curves_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
+def _curves_section(suite: str, results: Sequence[Result], paper: Table, pictures: Pictures) -> list[str]:
     """Learning curves of each environment."""
     lines = suite_lines(suite, (result.line for result in results))
     window = SUITES[suite].smoothing
@@ -341,7 +276,7 @@ def _continual_section(suite: str, results: Sequence[Result], paper: Table) -> l
     return parts
 
 
-def _ntk_section(suite: str, results: Sequence[Result], paper: Table, pictures: _Pictures) -> list[str]:
+def _ntk_section(suite: str, results: Sequence[Result], paper: Table, pictures: Pictures) -> list[str]:
     """The neural tangent kernel, of the runs that logged it."""
     lines = suite_lines(suite, (result.line for result in results))
     logged = [result for result in results if NTK[0].name in result.metrics]
@@ -366,10 +301,8 @@ def _by_env(results: Sequence[Result], paper: Table) -> dict[str, list[Result]]:
 def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence[str]) -> str:
     """How the runs were made, and which were left out."""
     hours = sum(result.seconds for result in results) / 3600
-    versions = Counter(versions_text(result.versions) for result in results)
     commits = Counter(result.git_commit or "no checkout" for result in results)
-    counted = [f"- {n} runs with {escaped(name)}" for name, n in versions.items()]
-    counted += [f"- {n} runs at {escaped(name)}" for name, n in commits.items()]
+    counted = [f"- {n} runs at {escaped(name)}" for name, n in commits.items()]
     budget = shlex.quote(" ".join(experiment.split()))
     commands = []
     for suite in dict.fromkeys(result.suite for result in results):
@@ -383,7 +316,7 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
         f"{len(results)} runs, {hours:.1f} hours of them in total. The `run.json` of each holds its command, "
         "versions and commit, too.",
         "\n".join(counted),
-        "The same command makes those that are missing:",
+        "These commands make the runs of this page, and the page:",
         "```bash\n" + "\n".join(commands) + "\n```",
     ]
     if left_out:

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from rliable import library, metrics
+from scipy import stats
 
 METRICS: dict[str, Callable[[np.ndarray], float]] = {
     "mean": metrics.aggregate_mean,
@@ -17,6 +19,35 @@ METRICS: dict[str, Callable[[np.ndarray], float]] = {
 N_RESAMPLES = 2000
 
 Interval = tuple[float, float]
+
+
+class Sample(NamedTuple):
+    """
+    What is known of a method's scores in an environment.
+
+    :param mean: Mean over the seeds
+    :param error: Its standard error, None for a single seed
+    :param n: Number of seeds
+    """
+
+    mean: float
+    error: float | None
+    n: int
+
+
+class Difference(NamedTuple):
+    """
+    One mean minus another.
+
+    :param value: The difference
+    :param interval: Welch's 95 % interval of it, None where one of the samples is a single seed or neither varies
+    :param effect: Hedges' g: the difference over the root of the mean of the two variances, corrected for few seeds; None
+        where there is no interval
+    """
+
+    value: float
+    interval: Interval | None
+    effect: float | None
 
 
 def mean_and_error(scores: Sequence[float]) -> tuple[float, float | None]:
@@ -43,6 +74,31 @@ def bootstrap_interval(scores: Sequence[float], n_resamples: int = 10_000, level
     means = np.random.default_rng(0).choice(scores, (n_resamples, len(scores))).mean(axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
+
+
+def sample(scores: Sequence[float]) -> Sample:
+    """
+    :param scores: One score per seed
+    :return: What the report knows of them
+    """
+    return Sample(*mean_and_error(scores), len(scores))
+
+
+def difference(one: Sample, other: Sample) -> Difference:
+    """
+    :param one: A sample
+    :param other: Another, independent of it
+    :return: The mean of the one minus that of the other
+    """
+    value = one.mean - other.mean
+    if one.error is None or other.error is None or one.error == other.error == 0:
+        return Difference(value, None, None)
+    squares = one.error**2, other.error**2
+    freedom = sum(squares) ** 2 / (squares[0] ** 2 / (one.n - 1) + squares[1] ** 2 / (other.n - 1))
+    low, high = stats.t.interval(0.95, freedom, loc=value, scale=sum(squares) ** 0.5)
+    deviation = ((one.n * squares[0] + other.n * squares[1]) / 2) ** 0.5
+    effect = value / deviation * (1 - 3 / (4 * (one.n + other.n - 2) - 1))
+    return Difference(value, (float(low), float(high)), effect)
 
 
 def agrees(interval: Interval, mean: float, standard_error: float) -> bool:

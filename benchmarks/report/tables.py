@@ -7,10 +7,11 @@ import numpy as np
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import lines_in_order, short_name, split_line, suite_lines
 from benchmarks.report.cells import Cell, Cells
-from benchmarks.report.estimates import agrees, best_two
+from benchmarks.report.estimates import best_two
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import AGGREGATE, Table
 from benchmarks.report.task_tables import MISSING, seeds_text
+from benchmarks.report.verdicts import AGREES, DISAGREES, verdict
 
 
 def method_label(suite: str, method: str) -> str:
@@ -76,8 +77,8 @@ def results_table(suite: str, cells: Cells, paper: Table) -> str:
                 sign = ""
                 if cell.interval is not None:
                     interval[-1] = f"[{cell.interval[0]:.{digits}f}, {cell.interval[1]:.{digits}f}]"
-                    if figure is not None:
-                        sign = " ✓" if agrees(cell.interval, figure.mean, figure.standard_error) else " ✗"
+                if figure is not None:
+                    sign = {AGREES: " ✓", DISAGREES: " ✗"}.get(verdict(cell, figure, paper.lengths[env_id]), "")
                 different = " †" if len(cell.versions) > 1 else ""
                 here[-1] = _marked(cell.mean, cell.error, digits, marks.get(method)) + sign + different
                 seeds[-1] = seeds_text(cell.seeds)
