@@ -5,7 +5,8 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -167,10 +168,8 @@ def train(run: Run, images: Images, n_tasks: int, after_task: Callable[[Progress
     """
     check_settings(run, images)
     th.set_num_threads(1)
-    # Where units are dead, Adam's moments decay to subnormal numbers, with which processors are many times slower
-    th.set_flush_denormal(True)
     run.state.parent.mkdir(parents=True, exist_ok=True)
-    with open_locked(run.state.with_name("lock"), f"Another process is making {run.name}"):
+    with open_locked(run.state.with_name("lock"), f"Another process is making {run.name}"), _without_subnormals():
         learner = Learner(run.method, run.settings, images.pixels.shape[1], run.seed)
         progress = _restore(run, images, learner)
         after_task(progress)
@@ -187,6 +186,16 @@ def train(run: Run, images: Images, n_tasks: int, after_task: Callable[[Progress
     if n_tasks >= run.problem.n_tasks:
         shutil.rmtree(run.state.parent)
     return progress
+
+
+@contextmanager
+def _without_subnormals() -> Iterator[None]:
+    """Where units are dead, Adam's moments decay to subnormal numbers, with which processors are many times slower."""
+    th.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        th.set_flush_denormal(False)
 
 
 def _restore(run: Run, images: Images, learner: Learner) -> Progress:
