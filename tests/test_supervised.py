@@ -288,7 +288,7 @@ def test_a_table_of_the_results(tmp_path):
     assert "Updates in a second of processor time: Vanilla: 61500; L2 Init: 2500." in text
     # 109 · 30 000 / 61 500 + 100 · 30 000 / 2500 seconds = 1253 seconds
     assert "Vanilla: 109 tasks; C-CHAIN: 150 tasks; L2 Init: 100 tasks; Weight clipping: 150 tasks. " in text
-    assert text.endswith("That is 0.3 core-hours, and the methods without a run at this speed.")
+    assert text.endswith("That is 0.3 core-hours at this speed, without the methods that have no run yet.")
 
 
 def test_the_command(tmp_path, images, monkeypatch, capsys):

@@ -133,8 +133,8 @@ def _missing(problem_name: str, results: Results) -> str:
             hours += n_missing * updates_per_task / speed / 3600
     if not words:
         return ""
-    price = f"{hours:.1f} core-hours" + ("" if priced else ", and the methods without a run")
-    return f"Missing for the paper's length, {PAPER_SEEDS} seeds: {'; '.join(words)}. That is {price} at this speed."
+    price = f"{hours:.1f} core-hours at this speed" + ("" if priced else ", without the methods that have no run yet")
+    return f"Missing for the paper's length, {PAPER_SEEDS} seeds: {'; '.join(words)}. That is {price}."
 
 
 def _mean(values: list[float]) -> str:
