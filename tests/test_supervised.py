@@ -178,7 +178,7 @@ def test_a_run_of_the_papers_length_leaves_results_alone(images, make_run, monke
     assert n_done(run) == 2 and not run.state.parent.exists()
     about = read_about(run.folder)
     assert about["updates"] == 2 * 2 * 3 and about["processor_seconds"] >= 0 and about["versions"]["torch"] == th.__version__
-    assert about["settings"]["data"] == images.source and about["settings"]["target_churn_ratio"] == 100
+    assert about["settings"]["data"] == images.source and about["settings"]["target_churn_ratio"] == 2
     assert "clip_ratio" not in about["settings"]  # it has none
 
 

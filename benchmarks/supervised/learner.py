@@ -43,9 +43,9 @@ class Settings:
 
     optimizer: str = "adam"
     learning_rate: float = 1e-3
-    target_churn_ratio: float = 100.0
+    target_churn_ratio: float = 2.0
     churn_coef: str = "auto"
-    l2_init_coef: float = 5e-4
+    l2_init_coef: float = 5e-3
     clip_ratio: float = 1.0
 
     def __post_init__(self) -> None:

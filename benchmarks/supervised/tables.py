@@ -102,7 +102,9 @@ def results_table(problem_name: str, results: Results) -> str:
 
 def _made_with(results: Results) -> str:
     settings = [result.about["settings"] for seeds in results.values() for result in seeds.values()]
-    lengths = dict.fromkeys(f"{each['images']} images, {each['epochs']} epochs" for each in settings)
+    lengths = dict.fromkeys(
+        f"{each['images']} images, {each['epochs']} epoch{'s' * (each['epochs'] > 1)}" for each in settings
+    )
     sources = dict.fromkeys(each["data"] for each in settings)
     speeds = "; ".join(
         f"{METHODS[method]}: {speed:.0f}" for method in METHODS if (speed := _updates_per_second(results[method])) is not None
