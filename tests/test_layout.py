@@ -24,6 +24,7 @@ EXTRAS = {
     *("matplotlib", "seaborn", "pandas", "rliable", "scipy"),
     *("rl_zoo3", "sb3_contrib", "huggingface_sb3", "optuna", "requests", "yaml", "ray", "river"),
     *("procgen", "gym3", "gym", "minatar", "minigrid", "ale_py", "cv2", "shimmy", "dm_control", "dm_env", "mujoco", "Box2D"),
+    *("torchvision", "sklearn"),
 }
 MODULES_OF_EXTRAS = ("sb3_cchain.zoo", "sb3_cchain.algorithms.contrib", "benchmarks")
 

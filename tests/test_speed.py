@@ -23,6 +23,7 @@ from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import PLACE, Table, write_tables
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
 from benchmarks.speed.update_parts import PARTS, REFERENCE, dqn_parts, parts_of_an_update, ppo_parts, watched
+from benchmarks.supervised.tasks import PROBLEMS
 from sb3_cchain import CChainPPO
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
@@ -211,7 +212,7 @@ def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
     of_family = [f"family_{name}" for name in family.CASES]
     of_family += ["family_evidence", *(f"falls_{name}" for name, case in family.CASES.items() if case.solved is not None)]
-    others = ["made_with", "gpu", "shelf"]
+    others = ["made_with", "gpu", "shelf", *(f"supervised_{name}" for name in PROBLEMS)]
     others += ["doctor_findings", "doctor_confusion", "doctor_wrong", "doctor_sick"]
     assert sorted(places) == sorted([*others, *speed.CASES, *speed.OTHERS, *of_family])
     assert not re.search(r"<!-- table: \w+ -->(?!\n)", "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")))
