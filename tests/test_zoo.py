@@ -331,18 +331,6 @@ def test_benchmark_enjoys_by_our_command(trained, tmp_path, monkeypatch, capsys)
     assert re.search(r"ppo_cchain *\| *Continual-Acrobot-v1", (tmp_path / "table" / "benchmark.md").read_text())
 
 
-@pytest.mark.parametrize("name", ["load_from_hub", "push_to_hub"])
-def test_the_hub_commands_know_our_names(name, capsys):
-    try:
-        import_module(f"rl_zoo3.{name}")
-    except ImportError as error:
-        pytest.skip(f"not with this version of huggingface_sb3: {error}")
-    with pytest.raises(SystemExit) as exit_info:
-        command(name, "--help")
-    assert exit_info.value.code == 0
-    assert "dqn_cchain" in capsys.readouterr().out
-
-
 # --- What is printed where something is missing or old -------------------------------------------------------------------
 
 

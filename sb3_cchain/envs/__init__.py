@@ -12,6 +12,7 @@ from sb3_cchain.envs.registration import register_envs
 from sb3_cchain.envs.reward_scale import RewardScale
 from sb3_cchain.envs.slippery_ant import ContinualSlipperyAnt
 from sb3_cchain.envs.space_padding import CommonSpaces, ContinualSequence
+from sb3_cchain.envs.task_caption import TaskCaption
 from sb3_cchain.envs.task_normalize import TaskVecNormalize
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "ProcgenGame",
     "RewardScale",
     "SeededStickyAction",
+    "TaskCaption",
     "TaskVecNormalize",
     "register_envs",
 ]

@@ -7,13 +7,14 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_list
 
 
-class FlatDMControl(gym.Wrapper):
+class FlatDMControl(gym.Wrapper, RecordConstructorArgs):
     """
     Makes an environment of dm_control, as Shimmy wraps it, suitable for Stable-Baselines3.
 
@@ -27,7 +28,8 @@ class FlatDMControl(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
         observations, actions = env.observation_space, env.action_space
         if not isinstance(observations, spaces.Dict) or not isinstance(actions, spaces.Box):
             raise TypeError(f"Flattening needs Dict observations and Box actions, got {observations} and {actions}")

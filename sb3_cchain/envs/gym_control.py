@@ -7,13 +7,14 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_number
 
 
-class ObservationOffset(gym.ObservationWrapper):
+class ObservationOffset(gym.ObservationWrapper, RecordConstructorArgs):
     """
     Adds a constant to each observation.
 
@@ -26,7 +27,9 @@ class ObservationOffset(gym.ObservationWrapper):
     """
 
     def __init__(self, env: gym.Env, offset: ArrayLike):
-        super().__init__(env)
+        # As a list, so that the environment's spec can be written as JSON
+        RecordConstructorArgs.__init__(self, offset=np.asarray(offset).tolist())
+        gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
         if not isinstance(space, spaces.Box):
             raise TypeError(f"An observation offset needs Box observations, got {space}")

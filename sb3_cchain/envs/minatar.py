@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.core import ActType, ObsType, RenderFrame
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import TransformReward
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from sb3_cchain.validation import check_bool, check_list, check_number
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 
 
-class ChannelPadding(gym.ObservationWrapper):
+class ChannelPadding(gym.ObservationWrapper, RecordConstructorArgs):
     """
     Appends channels that are ``False`` to each observation, so that games of different channels agree in their spaces.
 
@@ -28,7 +29,8 @@ class ChannelPadding(gym.ObservationWrapper):
     """
 
     def __init__(self, env: gym.Env, n_channels: int):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, n_channels=n_channels)
+        gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
         if not isinstance(space, spaces.Box) or space.dtype != np.bool_ or len(space.shape) != 3:
             raise TypeError(f"Channel padding needs boolean Box observations (height, width, channels), got {space}")
@@ -52,7 +54,7 @@ class ChannelPadding(gym.ObservationWrapper):
         return padded
 
 
-class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
+class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstructorArgs):
     """
     Truncates an episode after a number of steps in a row without reward.
 
@@ -62,7 +64,8 @@ class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     """
 
     def __init__(self, env: gym.Env[ObsType, ActType], n_steps: int):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, n_steps=n_steps)
+        gym.Wrapper.__init__(self, env)
         check_number("n_steps", n_steps, 1, integer=True)
         self.n_steps = int(n_steps)
 
@@ -86,7 +89,7 @@ class NoRewardLimit(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         return observation, reward, terminated, truncated, info
 
 
-class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
+class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstructorArgs):
     """
     Makes ``reset(seed=...)`` of a MinAtar game determine all that follows.
 
@@ -96,6 +99,10 @@ class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
 
     :param env: A MinAtar environment
     """
+
+    def __init__(self, env: gym.Env[ObsType, ActType]):
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ObsType, dict[str, Any]]:
         """
@@ -108,7 +115,7 @@ class SeededStickyAction(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         return self.env.reset(seed=seed, options=options)
 
 
-class PixelFrames(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
+class PixelFrames(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstructorArgs):
     """
     Makes the ``rgb_array`` frames of a MinAtar game suitable for a video recorder: integers from 0 to 255 instead of floats
     from 0 to 1, and enlarged from 10 × 10 pixels.
@@ -119,7 +126,8 @@ class PixelFrames(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     """
 
     def __init__(self, env: gym.Env[ObsType, ActType], scale: int = 16):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, scale=scale)
+        gym.Wrapper.__init__(self, env)
         check_number("scale", scale, 1, integer=True)
         self.scale = scale
         # MinAtar's own display shows a frame for 50 ms. Its mode "array" is the observation, which is no frame.

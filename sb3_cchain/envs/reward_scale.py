@@ -3,11 +3,12 @@
 from typing import SupportsFloat
 
 import gymnasium as gym
+from gymnasium.utils import RecordConstructorArgs
 
 from sb3_cchain.validation import check_number
 
 
-class RewardScale(gym.RewardWrapper):
+class RewardScale(gym.RewardWrapper, RecordConstructorArgs):
     """
     Multiplies each reward by a constant. A class, where Gymnasium's ``TransformReward`` takes a function, so that a YAML
     file can name it.
@@ -18,7 +19,8 @@ class RewardScale(gym.RewardWrapper):
     """
 
     def __init__(self, env: gym.Env, scale: float):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, scale=scale)
+        gym.RewardWrapper.__init__(self, env)
         check_number("scale", scale)
         self.scale = scale
 

@@ -7,13 +7,14 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_choice, check_list, check_number
 
 
-class CommonSpaces(gym.Wrapper):
+class CommonSpaces(gym.Wrapper, RecordConstructorArgs):
     """
     Makes an environment's observations longer and its actions more numerous, so that it agrees in its spaces with others.
 
@@ -33,7 +34,10 @@ class CommonSpaces(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env, observation_size: int, n_actions: int, extra_actions: str = "first"):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(
+            self, observation_size=observation_size, n_actions=n_actions, extra_actions=extra_actions
+        )
+        gym.Wrapper.__init__(self, env)
         check_choice("extra_actions", extra_actions, ("first", "wrap"))
         self.extra_actions = extra_actions
         own_observations, own_actions = observation_size_of(env), n_actions_of(env)

@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 import warnings
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,7 @@ from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo import inspect as zoo_inspect
 from sb3_cchain.zoo.checkpoint_options import find_resumed, make_parser, take_options
 from sb3_cchain.zoo.experiment import ExperimentManager
+from sb3_cchain.zoo.hub import working_clients
 from sb3_cchain.zoo.search import register_search_spaces
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
 
@@ -161,6 +163,7 @@ def run_module(name: str) -> None:
     with (
         replaced(subprocess, "call", call_sb3_cchain),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
+        working_clients() if name.endswith("_hub") else nullcontext(),
         warnings.catch_warnings(),
     ):
         # enjoy has imported load_from_hub before

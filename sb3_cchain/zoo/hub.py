@@ -1,0 +1,53 @@
+"""RL Zoo's commands for the Hugging Face Hub, with the clients that are installed."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import huggingface_hub.repocard
+import huggingface_sb3
+from huggingface_hub.utils import EntryNotFoundError
+from requests.exceptions import HTTPError
+
+from sb3_cchain.replaced import replaced
+
+
+@contextmanager
+def working_clients() -> Iterator[None]:
+    """
+    Inside the ``with`` block RL Zoo's modules ``push_to_hub`` and ``load_from_hub`` find what they expect of the clients, some
+    of which newer clients have changed:
+
+    - ``huggingface_sb3`` has renamed ``generate_metadata``.
+    - ``huggingface_hub`` no longer raises an error of ``requests`` for a file that is not there, such as the statistics of a
+      model without normalisation.
+
+    And the model card names the commands of this package, which know its algorithms.
+    """
+    push = import_module("huggingface_sb3.push_to_hub")  # the function of that name hides the module
+    with ExitStack() as stack:
+        if not hasattr(push, "generate_metadata"):
+            stack.enter_context(replaced(push, "generate_metadata", push._generate_metadata))
+        stack.enter_context(replaced(huggingface_sb3, "load_from_hub", _load_from_hub))
+        stack.enter_context(replaced(huggingface_hub.repocard, "metadata_save", _save_card))
+        yield
+
+
+_load, _save_metadata = huggingface_sb3.load_from_hub, huggingface_hub.repocard.metadata_save
+
+
+def _load_from_hub(repo_id: str, filename: str) -> str:
+    try:
+        return _load(repo_id, filename)
+    except EntryNotFoundError as error:
+        raise HTTPError(str(error)) from error
+
+
+def _save_card(path: Path, metadata: Any) -> None:
+    card = path.read_text(encoding="utf-8")
+    for stock, name in (("pip install rl_zoo3", 'pip install "sb3-cchain[zoo]"'), ("python -m rl_zoo3.", "sb3-cchain ")):
+        card = card.replace(stock, name)
+    path.write_text(card, encoding="utf-8")
+    _save_metadata(path, metadata if isinstance(metadata, dict) else metadata.to_dict())
