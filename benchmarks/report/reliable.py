@@ -131,7 +131,8 @@ def _metrics(
     table = markdown_table(["method", "seeds", *METRICS], [*rows, *further])
     if not several:
         return [table]
-    path, picture = pictures.add(f"{name}_{suite}", f"Metrics over the environments of {SUITES[suite].title}")
+    words = "" if name == "metrics" else ", normalised by the Oracle"
+    path, picture = pictures.add(f"{name}_{suite}", f"Metrics over the environments of {SUITES[suite].title}{words}")
     lines = suite_lines(suite, several)
     plot_reliable_metrics({method: estimates[method] for method in several}, intervals, list(METRICS), lines, path)
     return [table, picture]
