@@ -26,9 +26,9 @@ from sb3_cchain.analysis.model_outputs import ModelOutputs
 from sb3_cchain.analysis.remedies import Remedy
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
-from sb3_cchain.analysis.symptoms import network_symptoms, note_gradients, policy_change
+from sb3_cchain.analysis.symptoms import network_symptoms, note_gradients, policy_change, value_symptoms
 from sb3_cchain.methods.registry import METHOD_NAMES
-from tests.envs import RandomEnv
+from tests.envs import CountEnv, RandomEnv
 from tests.resume_cases import Stop, Stopped
 from tests.test_docs import ROOT
 
@@ -303,6 +303,19 @@ def test_any_saved_model(algorithm, observations, actions, tmp_path):
     assert {name.split("/")[0] for name in plain["measures"]} >= measured
     assert all(np.isfinite(value) for value in inspection.symptoms.values())
     assert algorithm.__name__ in html_report([inspection], "Report", with_picture=False)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_values_are_compared_with_the_rewards_of_single_steps(n_steps):
+    """Rewards of 1 add up to at most 1 / (1 - 0.5) = 2; values of 8 are four times as large."""
+    model = make(DQN, env=CountEnv(length=1000), gamma=0.5, n_steps=n_steps, learning_starts=150)
+    model.learn(150)
+    for parameter in model.q_net.parameters():
+        nn.init.zeros_(parameter)
+    nn.init.constant_(model.q_net.q_net[-1].bias, 8.0)
+    symptoms = value_symptoms(model, 32)
+    assert symptoms["value_excess"] == pytest.approx(4, rel=1e-3)
+    assert symptoms["value_scale"] == pytest.approx({1: 1 + 0.5 * 8, 3: 1.75 + 0.125 * 8}[n_steps], rel=0.1)
 
 
 # --- Remedies -----------------------------------------------------------------------------------------------------------

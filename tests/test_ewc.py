@@ -99,6 +99,18 @@ def test_of_sac():
         assert fisher[f"critic.{critic}.0.bias"].tolist() == [1]
 
 
+def test_of_sac_with_gsde():
+    """The distribution of the actions: its variance is 2 σ² for two features of 1."""
+    env = RandomEnv(action_space=spaces.Box(-1, 1, (1,)))
+    kwargs = dict(**policy_kwargs([2]), log_std_init=np.log(0.5))
+    model = SAC("MlpPolicy", env, device="cpu", seed=0, use_sde=True, **{**OFF_POLICY, "policy_kwargs": kwargs})
+    nn.init.zeros_(model.actor.latent_pi[0].weight)
+    nn.init.ones_(model.actor.latent_pi[0].bias)
+    nn.init.zeros_(model.actor.mu[0].weight)
+    fisher = consolidate(model, STATES[[0] * 1000], n_samples=1000)
+    assert fisher["actor.mu.0.bias"].item() == pytest.approx(1 / (2 * 0.5**2), rel=0.2)
+
+
 class Spy(EWCConsolidation):
     def _consolidate(self, observations):
         self.seen = [*getattr(self, "seen", []), observations]

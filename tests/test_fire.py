@@ -1,5 +1,6 @@
 """Weights become the nearest isometry."""
 
+import numpy as np
 import pytest
 import torch as th
 from gymnasium.spaces import Box
@@ -77,6 +78,17 @@ def test_of_several_optimisers_and_targets(algorithm):
             assert th.equal(model.policy.get_parameter(target), model.policy.get_parameter(name))
     for network in (model.actor, model.critic):
         assert network.optimizer.state and not any(p.dim() > 1 for p in network.optimizer.state)
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TD3])
+def test_targets_of_a_shared_extractor(algorithm):
+    env = RandomEnv(observation_space=Box(0, 255, (36, 36, 1), np.uint8), action_space=Box(-1, 1, (2,)))
+    policy_kwargs = dict(net_arch=[8], share_features_extractor=True)
+    model = algorithm("CnnPolicy", env, buffer_size=10, policy_kwargs=policy_kwargs, device="cpu")
+    callback = FIRE(interval=10)
+    callback.init_callback(model)
+    callback._act()
+    assert all(map(th.equal, model.critic.parameters(), model.critic_target.parameters()))
 
 
 def test_at_each_switch():

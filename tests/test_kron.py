@@ -63,6 +63,15 @@ def test_what_it_refuses(argument, value):
         Kron([nn.Parameter(th.ones(2, 2))], **{argument: value})
 
 
+def test_it_refuses_the_state_of_adam():
+    parameters = [nn.Parameter(th.ones(2, 2))]
+    for optimizer in (Kron(parameters), L2Init(parameters, base_class=Kron)):
+        before = optimizer.state_dict()
+        with pytest.raises(ValueError, match=r"`state_dict` must be that of Kron, got one without .*momentum"):
+            optimizer.load_state_dict(th.optim.Adam(parameters).state_dict())
+        assert optimizer.state_dict() == before
+
+
 @pytest.mark.parametrize("missing", ["pytorch_optimizer", "opt_einsum"])
 def test_it_says_what_to_install(monkeypatch, missing):
     if missing == "opt_einsum":

@@ -121,7 +121,14 @@ def test_adam_rel_restarts_the_count():
 
 @pytest.mark.parametrize(
     "argument, value",
-    [("n_output_layers", 1.5), ("lr_factor", -1), ("momentum", 1.5), ("nesterov", "yes"), ("weight_decay", -0.1)],
+    [
+        ("n_output_layers", 1.5),
+        ("lr_factor", -1),
+        ("momentum", 1.5),
+        ("momentum", 1),
+        ("nesterov", "yes"),
+        ("weight_decay", -0.1),
+    ],
 )
 def test_what_it_refuses(argument, value):
     with pytest.raises((ValueError, TypeError), match=f"`{argument}` must be .* got {value!r}"):

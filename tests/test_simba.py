@@ -94,7 +94,12 @@ def test_of_sac(tmp_path, algorithm, net_arch):
 
 @pytest.mark.parametrize(
     "name, policy, net_arch",
-    [("PPO", SimBaPolicy, dict(pi=[], vf=[8])), ("PPO", SimBaPolicy, [8, 6]), ("DQN", SimBaDQNPolicy, [8, 6])],
+    [
+        ("PPO", SimBaPolicy, dict(pi=[], vf=[8])),
+        ("PPO", SimBaPolicy, dict(pi=[8])),
+        ("PPO", SimBaPolicy, [8, 6]),
+        ("DQN", SimBaDQNPolicy, [8, 6]),
+    ],
 )
 def test_what_it_refuses(name, policy, net_arch):
     with pytest.raises(ValueError, match="`net_arch` must give each network one width or more, all the same"):

@@ -235,7 +235,9 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
       same. Not where the targets are all the same.
     - ``value_scale``: root mean square of the targets
     - ``value_excess``: the greatest :math:`|V|`, divided by :math:`\max |r| / (1 - \gamma)`, which no true value exceeds. Only
-      off-policy: the rewards of a rollout include what SB3 adds where a time limit ends an episode.
+      off-policy: the rewards of a rollout include what SB3 adds where a time limit ends an episode. With ``n_steps`` above 1,
+      the buffer gives sums of rewards :math:`R` and discounts :math:`\gamma^n`, and the bound is
+      :math:`\max (|R| / (1 - \gamma^n))`.
 
     Rewards and values are as the algorithm sees them, after any normalisation.
 
@@ -245,18 +247,19 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
     """
     if isinstance(model, OnPolicyAlgorithm):
         values, targets = (getattr(model.rollout_buffer, name).astype(np.float64) for name in ("values", "returns"))
-        rewards = None
+        bound = 0.0
     else:
-        values, targets, rewards = _replayed_values(model, batch_size)
+        values, targets, bound = _replayed_values(model, batch_size)
     symptoms = {"value_scale": float(np.sqrt(np.mean(targets**2)))}
     if targets.std() > 1e-6 * np.abs(targets).max():
         symptoms["value_spread"] = float(values.std() / targets.std())
-    if rewards is not None and rewards.any() and model.gamma < 1:
-        symptoms["value_excess"] = float(np.abs(values).max() * (1 - model.gamma) / np.abs(rewards).max())
+    if 0 < bound < math.inf:
+        symptoms["value_excess"] = float(np.abs(values).max() / bound)
     return symptoms
 
 
-def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Values, their targets, and the greatest value that the rewards can add up to."""
     assert model.replay_buffer is not None
     sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
     policy: Any = uncompiled(model.policy)
@@ -277,8 +280,11 @@ def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[np.nda
         values = values_of(sample.observations, sample.actions)
         following = values_of(sample.next_observations, None)
     rewards = sample.rewards.flatten()
-    targets = rewards + model.gamma * (1 - sample.dones.flatten()) * following
-    return tuple(tensor.double().cpu().numpy() for tensor in (values, targets, rewards))  # type: ignore[return-value]
+    # γ, or of each sample that of its n steps
+    discounts = th.full_like(rewards, model.gamma) if sample.discounts is None else sample.discounts.flatten()
+    targets = rewards + discounts * (1 - sample.dones.flatten()) * following
+    bound = float((rewards.abs() / (1 - discounts)).max()) if model.gamma < 1 else math.inf
+    return values.double().cpu().numpy(), targets.double().cpu().numpy(), bound
 
 
 def policy_change(old: ModelOutputs, new: ModelOutputs, old_std: th.Tensor | None, new_std: th.Tensor | None) -> float | None:

@@ -6,7 +6,6 @@ import numpy as np
 import torch as th
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from torch.distributions import Normal
 
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.methods.ewc import EWC
@@ -140,7 +139,8 @@ class EWCConsolidation(TaskBoundary):
         if isinstance(self.model, SAC):
             mean, log_std, kwargs = policy.actor.get_action_dist_params(observation)
             action = policy.actor.action_dist.actions_from_params(mean, log_std, **kwargs).detach()
-            log_probability = _of_draw(Normal(mean, log_std.exp()))
+            # With gSDE, `log_std` is of the noise's weights, not of the actions
+            log_probability = _of_draw(policy.actor.action_dist.distribution)
             return log_probability + _of_values(th.cat(policy.critic(observation, action))) * self.values
         log_probability = _of_draw(policy.get_distribution(observation))
         return log_probability + _of_values(policy.predict_values(observation)) * self.values

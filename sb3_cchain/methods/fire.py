@@ -68,17 +68,21 @@ class FIRE(SwitchOrInterval):
 
     def _act(self) -> None:
         policy = uncompiled(self.model.policy)
-        weights = dict(policy.named_parameters())
-        for name in trained_weights(policy):
-            isometry = nearest_isometry(weights[name].detach(), self.n_iterations)
+        # A weight that networks share has a name in each of them, and maybe a copy in the target network of one
+        weights = dict(policy.named_parameters(remove_duplicate=False))
+        isometries = {
+            weights[name]: nearest_isometry(weights[name].detach(), self.n_iterations) for name in trained_weights(policy)
+        }
+        for name, weight in weights.items():
             network, _, rest = name.partition(".")
-            for copy in (name, f"{network}_target.{rest}"):
-                if copy in weights:
-                    with th.no_grad():
-                        weights[copy].copy_(isometry)
-            if self.reset_moments:
-                for optimizer in model_optimizers(self.model).values():
-                    optimizer.state.pop(weights[name], None)
+            online = weights.get(f"{network.removesuffix('_target')}.{rest}", weight)
+            if online in isometries:
+                with th.no_grad():
+                    weight.copy_(isometries[online])
+        if self.reset_moments:
+            for optimizer in model_optimizers(self.model).values():
+                for weight in isometries:
+                    optimizer.state.pop(weight, None)
 
 
 def trained_weights(policy: nn.Module) -> list[str]:

@@ -69,6 +69,16 @@ class Kron(OptimizerWrapper):
         )
         super().__init__(params, lr, base_class=_kron_class(), base_kwargs=arguments)
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """
+        :param state_dict: Of Kron. There is no way from the state of Adam to that of Kron
+        :raises ValueError: When it is that of another optimiser
+        """
+        missing = self.param_groups[0].keys() - state_dict["param_groups"][0].keys()
+        if missing:
+            raise ValueError(f"`state_dict` must be that of Kron, got one without {', '.join(sorted(missing))}")
+        super().load_state_dict(state_dict)
+
 
 def _kron_class() -> type[th.optim.Optimizer]:
     missing = 'Kron needs pytorch-optimizer and opt-einsum: pip install "sb3-cchain[psgd]"'

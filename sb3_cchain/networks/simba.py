@@ -83,7 +83,10 @@ class SimBaPolicy(ActorCriticPolicy):
         super().__init__(*args, **{"net_arch": dict(pi=[128], vf=[512, 512]), **kwargs})
 
     def _build_mlp_extractor(self) -> None:
-        pi, vf = (self.net_arch["pi"], self.net_arch["vf"]) if isinstance(self.net_arch, dict) else [self.net_arch] * 2
+        if isinstance(self.net_arch, dict):
+            pi, vf = self.net_arch.get("pi", []), self.net_arch.get("vf", [])
+        else:
+            pi = vf = self.net_arch
         extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
         extractor.policy_net, extractor.latent_dim_pi = SimBaTrunk(self.features_dim, pi), pi[-1]
         extractor.value_net, extractor.latent_dim_vf = SimBaTrunk(self.features_dim, vf), vf[-1]
