@@ -51,7 +51,7 @@ class TaskCaption(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstru
         self._task = info.get(self.key)
         return observation, reward, terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8]:
         """
         :return: The frame with the task on it, ``(height, width, 3)``, ``uint8``
         """
