@@ -68,6 +68,7 @@ CONTENTS = {
         "DeepMind Control <results/dm_control>",
         "MinAtar <results/minatar>",
         "Other algorithms <results/family>",
+        "Supervised learning <results/supervised>",
         "Reference batches <results/references>",
         "Speed <results/speed>",
     ],
