@@ -82,7 +82,7 @@ def test_a_model_comes_back_from_the_hub(case, hub, capsys):
     capsys.readouterr()
     returns = []
     for logs in ("logs", "loaded"):
-        command("enjoy", *of, "-f", logs, "-n", "120", "--no-render", *FAST[:-1], "1")
+        command("enjoy", *of, "-f", logs, "-n", "120", "--no-render", "--device", "cpu", "--num-threads", "1")
         output = capsys.readouterr().out
         returns.append([line for line in output.splitlines() if line.startswith("Episode Reward")])
     assert returns[0] == returns[1] != []
