@@ -295,7 +295,7 @@ def test_a_run_is_the_command_that_a_user_would_type():
         (dict(seed=-1), "`seed` must be at least 0; got -1"),
         (dict(steps_per_task=0), "`steps_per_task` must be at least 1; got 0"),
         (dict(env_id="Continual/Maze-v0"), "`env_id` must be one of Continual/CartPole-v1, .*; got Continual/Maze-v0"),
-        (dict(method="redo"), "`method` must be one of oracle, vanilla, .*; got redo"),
+        (dict(method="reset"), "`method` must be one of oracle, vanilla, .*; got reset"),
         (
             dict(suite="minatar", env_id="Continual/MinAtar-v0", method="vanilla", steps_per_task=100, eval_freq=200),
             "between 1 and `steps_per_task`, which is 100; got 200",
@@ -319,7 +319,7 @@ def test_runs_that_cannot_be_are_refused(changes, message):
             ["--env", "Continual/Maze-v0"],
             "--env must be one of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0",
         ),
-        (["--method", "redo"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got redo"),
+        (["--method", "reset"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got reset"),
         (["--method", "cchain@x"], "`method` must have β after @, a number greater than 0, as in cchain@1e3; got cchain@x"),
         (["--method", "cchain@-1"], "a number greater than 0, .*; got cchain@-1"),
         (["--method", "trac@1e3"], "`method` can have a β after @ for cchain only; got trac@1e3"),
@@ -346,8 +346,8 @@ def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monke
 
 def test_an_empty_grid_is_an_error(capsys):
     with pytest.raises(SystemExit):
-        main(["--suite", "all", "--method", "redo", "--env", "Continual/Acrobot-v1"])
-    assert "--method must be one with hyperparameters for Continual/Acrobot-v1; got redo" in capsys.readouterr().err
+        main(["--suite", "all", "--method", "parseval", "--env", "Continual/Starpilot-v0"])
+    assert "--method must be one with hyperparameters for Continual/Starpilot-v0; got parseval" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_to_is_found_before_any_work(tmp_path, capsys, monkeypatch):
