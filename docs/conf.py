@@ -4,9 +4,13 @@ Sphinx configuration: ``make doc``.
 The table of contents is here and not in ``index.md``, because GitHub shows directives as they are typed.
 """
 
-from pathlib import Path
+from __future__ import annotations
 
-from sphinx.application import Sphinx
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the tests read this file without Sphinx
+    from sphinx.application import Sphinx
 
 project = "sb3_cchain"
 copyright = "2026, sb3_cchain contributors"

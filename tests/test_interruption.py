@@ -82,8 +82,7 @@ def attached(model):
     return hooks + [name for o in owners if o for name, value in vars(o).items() if isinstance(value, functions)]
 
 
-@pytest.mark.parametrize("where", ["update", "step"])
-@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+@pytest.mark.parametrize("algorithm, where", [("PPO", "update"), ("DQN", "update"), ("PPO", "step")])
 @pytest.mark.parametrize("name", sorted(PUBLIC))
 def test_training_without_the_callback_is_plain_training(tmp_path, monkeypatch, name, algorithm, where):
     monkeypatch.chdir(tmp_path)

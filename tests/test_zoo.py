@@ -223,12 +223,6 @@ def test_a_method_by_either_command(tmp_path, capsys):
 # --- Commands -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"]])
-def test_usage(arguments):
-    with pytest.raises(SystemExit, match=r"usage: sb3-cchain {train\|enjoy\|inspect\|plot_train.*record_video"):
-        command(*arguments)
-
-
 def test_unknown_environment_names_the_nearest():
     with pytest.raises(ValueError, match="you maybe meant Continual/Acrobot-v1"):
         command("train", "--algo", "ppo_cchain", "--env", "Continual/Acrobat-v1")

@@ -74,7 +74,7 @@ class Kron(OptimizerWrapper):
         :param state_dict: Of Kron. There is no way from the state of Adam to that of Kron
         :raises ValueError: When it is that of another optimiser
         """
-        missing = self.param_groups[0].keys() - state_dict["param_groups"][0].keys()
+        missing = {"precondition_init_scale", "precondition_lr"} - state_dict["param_groups"][0].keys()
         if missing:
             raise ValueError(f"`state_dict` must be that of Kron, got one without {', '.join(sorted(missing))}")
         super().load_state_dict(state_dict)
