@@ -18,6 +18,7 @@ from sb3_cchain.callbacks import TaskLearningStarts, TaskSchedule, read_returns
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods import (
     EWC,
+    FIRE,
     EntropyBonusRestart,
     EWCConsolidation,
     ExplorationRateRestart,
@@ -205,6 +206,7 @@ LISTENERS = {
     "Oracle": boundary(Oracle),
     "ShrinkAndPerturb": boundary(lambda: ShrinkAndPerturb(0.5, interval=None)),
     "LayerReset": boundary(LayerReset),
+    "FIRE": boundary(FIRE),
     "PlasticityInjection": boundary(PlasticityInjection, InjectionPolicy),
     "EWCConsolidation": boundary(EWCConsolidation, optimizer_class=EWC),
     "ExplorationRateRestart": boundary(ExplorationRateRestart),
