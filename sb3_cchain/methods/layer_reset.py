@@ -6,9 +6,9 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
 from sb3_cchain.methods.fresh_policy import fresh_policy
+from sb3_cchain.methods.plain_networks import check_plain_networks
 from sb3_cchain.methods.switch_or_interval import SwitchOrInterval
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -64,14 +64,8 @@ class LayerReset(SwitchOrInterval):
         self.n_layers = n_layers
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, (OnPolicyAlgorithm, DQN)):
-            raise TypeError(f"LayerReset is for on-policy algorithms and DQN, got {type(self.model).__name__}")
-        if hasattr(self.model, "_last_lstm_states"):
-            raise TypeError(f"LayerReset does not know recurrent networks, got {type(self.model).__name__}")
-        policy = uncompiled(self.model.policy)
-        if any(isinstance(module, Injectable) for module in policy.modules()):
-            raise TypeError(f"LayerReset does not know heads for plasticity injection, got {type(policy).__name__}")
-        n_layers = min(map(len, network_layers(policy)))
+        check_plain_networks("LayerReset", self.model)
+        n_layers = min(map(len, network_layers(uncompiled(self.model.policy))))
         if self.n_layers is not None and self.n_layers > n_layers:
             raise ValueError(f"`n_layers` must be at most {n_layers}, the layers of the network, got {self.n_layers!r}")
 

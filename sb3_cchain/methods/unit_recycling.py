@@ -18,9 +18,9 @@ from sb3_cchain.methods.adam_rel import reset_step_count
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units
+from sb3_cchain.methods.plain_networks import check_plain_networks
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
-from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.validation import check_number
 
 
@@ -37,14 +37,7 @@ class UnitRecycling(BaseCallback):
     model: OnPolicyAlgorithm | DQN
 
     def _init_callback(self) -> None:
-        name, algorithm = type(self).__name__, type(self.model).__name__
-        if not isinstance(self.model, (OnPolicyAlgorithm, DQN)):
-            raise TypeError(f"{name} is for on-policy algorithms and DQN, got {algorithm}")
-        if hasattr(self.model, "_last_lstm_states"):
-            raise TypeError(f"{name} does not know recurrent networks, got {algorithm}")
-        policy = uncompiled(self.model.policy)
-        if any(isinstance(module, Injectable) for module in policy.modules()):
-            raise TypeError(f"{name} does not know heads for plasticity injection, got {type(policy).__name__}")
+        check_plain_networks(type(self).__name__, self.model)
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
