@@ -24,7 +24,12 @@ from benchmarks.speed.tables import Table, write_tables
 from benchmarks.speed.timing import ratio
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 
-NEXT = 'CChainPPO, `churn_reference="next"`'
+# Name, class, file of hyperparameters, arguments that differ
+PPOS: tuple[tuple[str, type[PPO], str, dict[str, Any]], ...] = (
+    ("PPO", PPO, "ppo", {}),
+    ("CChainPPO", CChainPPO, "ppo_cchain", {}),
+    ('CChainPPO, `churn_reference="next"`', CChainPPO, "ppo_cchain", dict(churn_reference="next")),
+)
 
 
 def impala_ppo(device: str) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -32,11 +37,7 @@ def impala_ppo(device: str) -> Iterator[tuple[str, Callable[[], Any]]]:
     :param device: PyTorch device
     :return: By name, an epoch over 2500 images of ProcGen's shape, with its shipped network and minibatches
     """
-    for name, algorithm, algo, arguments in (
-        ("PPO", PPO, "ppo", {}),
-        ("CChainPPO", CChainPPO, "ppo_cchain", {}),
-        (NEXT, CChainPPO, "ppo_cchain", dict(churn_reference="next")),
-    ):
+    for name, algorithm, algo, arguments in PPOS:
         yield name, with_rollout(algorithm, algo, 50, 50, n_epochs=1, device=device, **arguments).train
 
 
@@ -45,11 +46,7 @@ def mlp_ppo(device: str) -> Iterator[tuple[str, Callable[[], Any]]]:
     :param device: PyTorch device
     :return: By name, an iteration's updates under the shipped settings of continual Acrobot
     """
-    for name, algorithm, algo, arguments in (
-        ("PPO", PPO, "ppo", {}),
-        ("CChainPPO", CChainPPO, "ppo_cchain", {}),
-        (NEXT, CChainPPO, "ppo_cchain", dict(churn_reference="next")),
-    ):
+    for name, algorithm, algo, arguments in PPOS:
         settings = model_settings(algo, "Continual/Acrobot-v1", device=device, **arguments)
         yield name, algorithm(**settings).learn(settings["n_steps"]).train
 
