@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--suite",
         required=True,
         choices=[*SUITES, "shelf", "all"],
-        help="Suite; shelf: all methods of the registry, in two environments of Gym Control at the budget reduced",
+        help="Suite; shelf: all methods of PPO in the registry, in three environments at the budget reduced",
     )
     parser.add_argument("--env", nargs="+", help="Environment ids, by default all of the suite")
     parser.add_argument(

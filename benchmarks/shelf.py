@@ -1,5 +1,5 @@
 """
-All methods beside each other: J(T) on two continual environments, and what an iteration costs. Trains nothing.
+All methods beside each other: J(T) on three continual environments, and what an iteration costs. Trains nothing.
 
     python -m benchmarks.run --suite shelf     # makes the runs that are missing
     python -m benchmarks.shelf                 # prints the table
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.grid.plan import SHELF_SUITE, shelf_runs
+from benchmarks.grid.plan import SHELF_SUITES, shelf_runs
 from benchmarks.grid.results import Result, find_result
 from benchmarks.grid.run import ROOT, Run, short_name, suite_methods
 from benchmarks.report.markdown import markdown_table
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scores = read_scores(runs, args.results)
     costs = read_costs(args.docs / COSTS)
     there = {run.method for run in runs}
-    methods = {name: method for name, method in suite_methods(SHELF_SUITE).items() if name in there}
+    methods = {name: method for name, method in suite_methods(SHELF_SUITES[0]).items() if name in there}
     table = shelf_table(scores, costs, methods)
     print(table)
     if args.write:

@@ -18,7 +18,8 @@ def test_the_runs_of_the_shelf():
     runs = shelf_runs()
     assert {run.env_id for run in runs} == set(SHELF_ENVS) and {run.seed for run in runs} == {0, 1}
     assert {run.method for run in runs} == set(suite_methods("gym_control"))
-    assert all((run.n_tasks, run.steps_per_task, run.experiment) == (4, 64_000, "reduced") for run in runs)
+    lengths = {run.suite: (run.n_tasks, run.steps_per_task, run.experiment) for run in runs}
+    assert lengths == {"gym_control": (4, 64_000, "reduced"), "dmc": (3, 100_000, "reduced")}
     (run,) = shelf_runs(["Continual/Acrobot-v1"], ["trac"], 1, "smoke")
     assert (run.method, run.experiment) == ("trac", "smoke")
 
@@ -36,7 +37,7 @@ def test_a_table_from_the_best_to_the_worst():
 
 def test_the_committed_results_are_read(tmp_path):
     scores = shelf.read_scores(shelf_runs(methods=["vanilla"]), ROOT / "benchmarks/results")
-    assert {env_id: len(of_env["vanilla"]) for env_id, of_env in scores.items()} == dict.fromkeys(SHELF_ENVS, 2)
+    assert {env_id: len(scores[env_id]["vanilla"]) for env_id in SHELF_ENVS[:2]} == dict.fromkeys(SHELF_ENVS[:2], 2)
     costs = shelf.read_costs(ROOT / "docs" / shelf.COSTS)
     assert costs["PPO"] == 1 and 0.5 < costs["TRAC"] < 3
 

@@ -179,6 +179,12 @@ DIFFERENCES = {
     ("ppo_layer_norm", "procgen"): ([], "features_extractor_kwargs=dict(layer_norm=True)"),
     ("ppo_redo", "procgen"): ([REDO], ""),
     ("ppo_adam_rel", "procgen"): (["sb3_cchain.methods.AdamRel"], ""),
+    ("ppo_trac", "dmc"): (METRICS, optimizer("TRAC", "base_kwargs=dict(eps=1e-5)")),
+    ("ppo_weight_clipping", "dmc"): (METRICS, optimizer("WeightClipping", "clip_ratio=1.0, base_kwargs=dict(eps=1e-5)")),
+    ("ppo_l2_init", "dmc"): (METRICS, optimizer("L2Init", "coef=10.0, reduction='mean', base_kwargs=dict(eps=1e-5)")),
+    ("ppo_layer_norm", "dmc"): ([], ""),
+    ("ppo_redo", "dmc"): ([REDO], ""),
+    ("ppo_adam_rel", "dmc"): (["sb3_cchain.methods.AdamRel"], ""),
     ("double_dqn_oracle", "minatar"): ([{ORACLE: {"reset_replay_buffer": True}}], ""),
 }
 
@@ -221,15 +227,17 @@ def test_the_papers_methods_have_these_settings(method):
         callbacks, arguments = DIFFERENCES[method, suite]
         for env_id in ENV_IDS[suite]:
             env_settings = vanilla[env_id]
-            policy_kwargs = env_settings.get("policy_kwargs", f"dict({ADAM})" if arguments else "dict()").replace(
-                ADAM, arguments
-            )
+            policy_kwargs = env_settings.get("policy_kwargs", "dict()")
+            if suite == "gym_control":
+                policy_kwargs = policy_kwargs.replace(ADAM, arguments)
+            elif arguments:
+                policy_kwargs = policy_kwargs[:-1] + (", " if suite == "dmc" else "") + arguments + ")"
             expected[env_id] = {
                 **env_settings,
                 "callback": [*env_settings["callback"], *callbacks],
                 "policy_kwargs": policy_kwargs,
             }
-            if (method, suite) == ("ppo_layer_norm", "gym_control"):
+            if method == "ppo_layer_norm" and suite != "procgen":
                 expected[env_id]["policy"] = "sb3_cchain.networks.LayerNormPolicy"
     covered = {env_id: env_settings for env_id, env_settings in settings.items() if not env_id.endswith("-defaults")}
     assert {env_id: parsed(env_settings) for env_id, env_settings in covered.items()} == {

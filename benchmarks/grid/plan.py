@@ -12,8 +12,8 @@ BUDGETS = ("paper", "reduced", "smoke")
 N_SEEDS = {"reduced": 3, "smoke": 1}
 
 # Where all methods of the registry are compared with each other, those of the paper and the others
-SHELF_SUITE = "gym_control"
-SHELF_ENVS = ("Continual/Acrobot-v1", "Continual/LunarLander-v3")
+SHELF_SUITES = ("gym_control", "dmc")
+SHELF_ENVS = ("Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/Walker-v0")
 SHELF_SEEDS = 2
 
 
@@ -103,8 +103,8 @@ def shelf_runs(
     :return: As :func:`grid_runs`
     :raises ValueError: As :func:`grid_runs`
     """
-    methods = methods or list(suite_methods(SHELF_SUITE))
-    return grid_runs([SHELF_SUITE], env_ids or SHELF_ENVS, methods, n_seeds or SHELF_SEEDS, budget)
+    methods = methods or list(suite_methods(SHELF_SUITES[0]))
+    return grid_runs(SHELF_SUITES, env_ids or SHELF_ENVS, methods, n_seeds or SHELF_SEEDS, budget)
 
 
 def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:
