@@ -6,6 +6,7 @@ from sb3_cchain.callbacks.returns_file import read_returns
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 from sb3_cchain.callbacks.schedules import OverallSchedule, TaskSchedule
 from sb3_cchain.callbacks.task_learning_starts import TaskLearningStarts
+from sb3_cchain.callbacks.task_progress_bar import TaskProgressBar
 
 __all__ = [
     "ContinualMetrics",
@@ -13,6 +14,7 @@ __all__ = [
     "OverallSchedule",
     "RolloutNormalizedAdvantage",
     "TaskLearningStarts",
+    "TaskProgressBar",
     "TaskSchedule",
     "read_returns",
     "task_averages",

@@ -47,6 +47,11 @@ class TaskClock:
         return self._pinned_task is not None
 
     @property
+    def switches(self) -> list[int]:
+        """Environment steps since the first task began at which each further task begins; none when pinned to a task."""
+        return [] if self.is_pinned else [end - self._first_step for end in self._ends[self.first_task :]]
+
+    @property
     def task_steps(self) -> float:
         """Environment steps made since the present task began, over all environments; infinite when pinned to a task."""
         return math.inf if self.is_pinned else self._total_steps - [0, *self._ends][self.task_id]

@@ -64,6 +64,19 @@ def episode_task(model: BaseAlgorithm) -> Any:
     return _known_task(model, first_reset_info(model.env)) if signal is None else signal.next_task
 
 
+def told_task(model: BaseAlgorithm) -> Any:
+    """
+    :param model: A model during ``learn()``
+    :return: The task of :func:`episode_task`, for a display, which must not count; None where there has been no switch of
+        environments that do not number their tasks
+    """
+    assert model.env is not None
+    signal = active_signal(model.env)
+    if signal is not None:
+        return signal.next_task
+    return first_reset_info(model.env).get(TASK_KEY, getattr(model, "task_count", None) or None)
+
+
 def _known_task(model: BaseAlgorithm, info: dict[str, Any]) -> Any:
     return info[TASK_KEY] if TASK_KEY in info else task_count(model)
 

@@ -115,6 +115,13 @@ class TaskSignal(BaseCallback):
         """The task that the next step will be made in."""
         return self.model.task_signal["task"]  # type: ignore[attr-defined]
 
+    @property
+    def next_switch(self) -> int | None:
+        """Environment steps after which the next task begins; None where that is not known before."""
+        if self.switch_every is not None:
+            return (self.num_timesteps // self.switch_every + 1) * self.switch_every
+        return next((step for step in self.switch_at or () if step > self.num_timesteps), None)
+
     def _on_training_start(self) -> None:
         require_single(self)
         if self.attribute is not None and not self.training_env.has_attr(self.attribute):

@@ -21,6 +21,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_cchain.callbacks import TaskProgressBar
 from sb3_cchain.checkpoint import (
     SafeCheckpointCallback,
     SaveBestModel,
@@ -154,7 +155,10 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         """Make the callbacks of the command line's options."""
         checkpoint_callback = partial(SafeCheckpointCallback, save_vecnormalize=True)
         n_given = len(self.callbacks)
-        with replaced(rl_zoo3.exp_manager, "CheckpointCallback", checkpoint_callback):
+        with (
+            replaced(rl_zoo3.exp_manager, "CheckpointCallback", checkpoint_callback),
+            replaced(rl_zoo3.exp_manager, "ProgressBarCallback", TaskProgressBar),
+        ):
             super().create_callbacks()
         for callback in self.callbacks[n_given:]:
             if isinstance(callback, EvalCallback):
@@ -228,6 +232,10 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             except KeyboardInterrupt:  # which RL Zoo takes for the end
                 self._was_interrupted = True
                 raise
+            finally:
+                for callback in self.callbacks:
+                    if isinstance(callback, TaskProgressBar):
+                        callback.close()
 
         super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
 
