@@ -29,7 +29,7 @@ class TaskProgressBar(BaseCallback):
     .. code-block:: text
 
         task 1 (2 of 3) run, next in 28,400 steps (0:01:20), return 24.3
-         37% ━━━━━━━━━━━━╸━━━━━━━━━━━━━━━━ 171,600/480,000 0:04:10 < 0:10:20, 780 steps/s
+         36% ━━━━━━━━━━━━╸━━━━━━━━━━━━━━━━ 171,600/480,000 0:04:10 < 0:10:20, 780 steps/s
 
     Tasks are numbered from 0, as everywhere, and have their names where they have some. They are those of a
     :class:`~sb3_cchain.ContinualEnv` or of a :class:`~sb3_cchain.TaskSignal`; when the next one begins is shown where it is
@@ -95,6 +95,8 @@ class TaskProgressBar(BaseCallback):
         live, self._live = self._live, None
         if live is not None:
             live.stop()
+            if not live.console.is_terminal:
+                live.console.line()
             atexit.unregister(self.close)
 
     def _on_rollout_start(self) -> None:
@@ -144,7 +146,7 @@ class TaskProgressBar(BaseCallback):
         bar.add_column(ratio=1)
         bar.add_column(no_wrap=True)
         bar.add_row(
-            f"{step / total:4.0%}",
+            f"{min(step / total, 1):4.0%}",
             ProgressBar(total=total, completed=step),
             f"{step:,}/{total:,} {elapsed} < {left}, {speed} steps/s",
         )

@@ -39,6 +39,7 @@ from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, differences, plain, write_record
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
+from sb3_cchain.zoo.summary import TrainingSummary
 
 
 class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -215,7 +216,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        Train a model. One that was loaded goes on counting its steps.
+        Train a model. One that was loaded goes on counting its steps. With checkpoints, SIGTERM ends it with the summary.
 
         :param model: The model
         :raises SystemExit: With checkpoints, when training was stopped by SIGTERM
@@ -223,6 +224,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if self.tensorboard_log is not None:
             folder = make_run_folder(self.tensorboard_log, type(model).__name__)
             model.set_logger(configure(str(folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
+        self._summary = TrainingSummary(model, self.args, Path(self.save_path), self.env_name)
         # RL Zoo's method has no place for `reset_num_timesteps`
         learn = partial(model.learn, reset_num_timesteps=False) if self.continue_training else model.learn
 
@@ -232,16 +234,24 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             except KeyboardInterrupt:  # which RL Zoo takes for the end
                 self._was_interrupted = True
                 raise
+            except SystemExit:  # by SIGTERM, with checkpoints: no model is saved
+                self._close_progress_bar()
+                self._summary.print()
+                raise
             finally:
-                for callback in self.callbacks:
-                    if isinstance(callback, TaskProgressBar):
-                        callback.close()
+                self._close_progress_bar()
 
         super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
 
+    def _close_progress_bar(self) -> None:
+        for callback in self.callbacks:
+            if isinstance(callback, TaskProgressBar):
+                callback.close()
+
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        Save the model, the statistics of its ``VecNormalize`` if there is one, and its replay buffer if asked for.
+        Save the model, the statistics of its ``VecNormalize`` if there is one, and its replay buffer if asked for. Then print
+        the summary of the training.
 
         :param model: The model
         :raises SystemExit: With checkpoints, when training was interrupted by Ctrl-C
@@ -256,6 +266,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             with write_safely(f"{self.save_path}/replay_buffer.pkl") as path:
                 model.save_replay_buffer(path)
         save_model(model, f"{self.save_path}/{self.env_name}.zip")
+        self._summary.print()
         if self._was_interrupted and self.checkpoints is not None:
             sys.exit(128 + signal.SIGINT)
 
