@@ -9,6 +9,7 @@ folder for each run. The same command goes on where it was interrupted.
 """
 
 import argparse
+import shlex
 import signal
 import sys
 from collections import Counter
@@ -25,6 +26,7 @@ from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs, shelf_runs
 from benchmarks.grid.results import find_result, read_result, read_results
 from benchmarks.grid.run import Run
+from benchmarks.grid.scores import score_table
 from benchmarks.grid.suites import SUITES
 from benchmarks.grid.view import duration
 from sb3_cchain.checkpoint import check_writable
@@ -82,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             list_grid(grid, args.results, args.logs, console)
             return 0
         if all(find_result(run, args.results) for run in grid):
-            console.print(f"All {len(grid)} runs are done. Results: {args.results}")
+            console.print(f"All {len(grid)} runs are done.")
+            print_scores(grid, args.results, console)
             print_versions(grid, args.results, console)
             return 0
         print_replaced(grid, args.results, console)
@@ -100,9 +103,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, SystemExit) as stopped:
         console.print("Interrupted. The same command goes on.")
         return 128 + (signal.SIGTERM if isinstance(stopped, SystemExit) else signal.SIGINT)
-    console.print(f"{len(grid) - len(failures)} of {len(grid)} runs are done, {len(failures)} failed. Results: {args.results}")
+    console.print(f"{len(grid) - len(failures)} of {len(grid)} runs are done, {len(failures)} failed.")
     for failure in failures:
         console.print(str(failure), style="red", soft_wrap=True, highlight=False, markup=False)
+    print_scores(grid, args.results, console)
     print_versions(grid, args.results, console)
     return 1 if failures else 0
 
@@ -153,6 +157,25 @@ def list_grid(grid: Sequence[Run], results: Path, logs: Path, console: Console) 
     )
     print_replaced(grid, results, console)
     print_versions(grid, results, console)
+
+
+def print_scores(grid: Sequence[Run], results: Path, console: Console) -> None:
+    """
+    Print what the runs that are done have reached, where their results are, and how to make the report.
+
+    :param grid: Runs of the grid
+    :param results: Folder of all results
+    :param console: Where it is printed
+    """
+    done = [result for run in grid if (result := find_result(run, results))]
+    if done:
+        console.print(score_table(done))
+    budgets = shlex.join(dict.fromkeys(run.experiment for run in grid))
+    for line in (
+        f"Results: {results}",
+        f"Report:  python -m benchmarks.report --budget {budgets} --results {shlex.quote(str(results))}",
+    ):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def print_replaced(grid: Sequence[Run], results: Path, console: Console) -> None:

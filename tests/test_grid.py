@@ -26,7 +26,7 @@ from benchmarks.grid.results import METRIC_PREFIXES, RENAMED, Result, find_resul
 from benchmarks.grid.run import ROOT, Run, as_json, make_run, other_beta, paper_methods, split_line, suite_methods
 from benchmarks.grid.suites import SUITES, task_names
 from benchmarks.grid.training import metrics_rows
-from benchmarks.grid.view import Failure, View, duration
+from benchmarks.grid.view import Failure, Progress, View, duration
 from benchmarks.run import main
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 from tests.fake_training import fake_program, save_checkpoint
@@ -448,15 +448,18 @@ def test_time_left_by_hand(monkeypatch):
     view.start(some[2])
     view.skip(some[3])
     assert view.time_left() == pytest.approx(30.0)
-    view.progress = {some[2]: "50%, task 1, return -3"}
+    now = 140.0
+    view.progress = {some[2]: Progress(0.4, "40%, task 1, return -3")}
+    # Ten seconds for 40 % of it: 15 for the rest, whatever the estimate
+    assert view.time_left() == pytest.approx((15 + 30) / 2)
     console.print(view.render())
     shown = console.export_text().splitlines()
     assert shown[0] == "4 of 8: CartPole-v1 cchain seed 0 done in 30 s, 45 s left"
     failure = "CartPole-v1 cchain seed 1 failed: ValueError: [no]; see elsewhere:/logs/log.txt"
     assert shown[1].strip() == f"{failure} (tried again)"
     assert shown[2].strip() == failure and shown[-1].strip() == failure
-    assert shown[3].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 30 s left"
-    assert shown[4].split() == "CartPole-v1 cchain seed 2 0 s 50%, task 1, return -3".split()
+    assert shown[3].strip("━╸╺ ") == "5 done (3 before), 1 running, 1 waiting, 1 failed, 23 s left"
+    assert shown[4].split() == "CartPole-v1 cchain seed 2 10 s 40%, task 1, return -3 15 s left".split()
 
 
 def test_an_address_at_which_nothing_answers():
@@ -636,8 +639,8 @@ def test_every_run_comes_to_its_end_or_fails_thrice(tmp_path, backend, monkeypat
 def test_the_progress_of_local_runs_is_shown(tmp_path):
     with LocalBackend(1, program=fake_program(tmp_path / "fake", {0: ["hang"]})) as backend:
         backend.start(RUN, tmp_path)
-        shown = wait_for(lambda: [text for text in backend.progress().values() if text], "progress", 30)
-    assert shown == ["50%, task 0, return -10"]
+        shown = wait_for(lambda: list(backend.progress().values()), "progress", 30)
+    assert shown == [(0.5, "50%, task 0, return -10")]
 
 
 @linux
@@ -732,9 +735,9 @@ def test_a_killed_and_a_stopped_training_end_as_one_that_was_not(tmp_path, monke
     with LocalBackend(1) as backend:
         backend.start(run, logs)
         origin = next(iter(backend._running.values()))[0].attempt.origin.num_timesteps
-        share = wait_for(lambda: re.match(r"(\d+)%.*, from (\d+)%", "".join(backend.progress().values())), "progress")
-        assert int(share[2]) == round(100 * origin / run.total_steps)
-        wait_for(lambda: int("".join(backend.progress().values()).partition("%")[0] or 0) > int(share[2]), "further training")
+        (progress,) = wait_for(lambda: list(backend.progress().values()), "progress")
+        assert progress.words.endswith(f", from {origin / run.total_steps:.0%}")
+        wait_for(lambda: backend.progress()[run].share > origin / run.total_steps, "further training")
     (stopped,) = steps_saved(1)
     assert stopped > origin
     with LocalBackend(1) as backend:

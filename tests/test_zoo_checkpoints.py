@@ -137,9 +137,9 @@ def test_training_that_is_told_to_stop_says_how_to_go_on(tmp_path, at_step, caps
     folder = run_folder(tmp_path, 2)
     assert [path.name for path in (folder / "checkpoints").glob("step_*")] == ["step_000000000128"]
     assert (folder / f"{NAME}.zip").exists() == (number == signal.SIGINT)
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("sb3-cchain train")]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Go on:")]
     assert line.endswith(f"--resume {folder}")
-    command(*shlex.split(line)[1:])
+    command(*shlex.split(line)[3:])  # without "Go on: sb3-cchain"
     assert_same_end(tmp_path, 1, 3)
 
 

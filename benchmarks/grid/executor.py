@@ -21,7 +21,7 @@ from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import Result, find_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run
 from benchmarks.grid.training import SECONDS_TO_STOP, Finished, Training, TrainingFailed
-from benchmarks.grid.view import Failure, View
+from benchmarks.grid.view import Failure, Progress, View
 
 # How often a run that dies, by itself or with its machine, is started again
 RETRIES = 2
@@ -59,7 +59,7 @@ class Backend(ABC):
         :return: Runs that have ended, and how
         """
 
-    def progress(self) -> dict[Run, str]:
+    def progress(self) -> dict[Run, Progress]:
         """
         :return: How far each running run is, where that is known here
         """
@@ -250,9 +250,10 @@ class LocalBackend(Backend):
                     ended.append((run, Failure(run, *error.args)))
         return ended
 
-    def progress(self) -> dict[Run, str]:
+    def progress(self) -> dict[Run, Progress]:
         """See :class:`Backend`."""
-        return {run: training.progress() for run, (training, _) in self._running.items()}
+        found = {run: training.progress() for run, (training, _) in self._running.items()}
+        return {run: progress for run, progress in found.items() if progress is not None}
 
     def seconds_before(self) -> dict[Run, float]:
         """See :class:`Backend`."""

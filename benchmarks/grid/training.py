@@ -20,6 +20,7 @@ from benchmarks.grid.attempts import Attempt, new_attempt
 from benchmarks.grid.results import METRIC_PREFIXES, Result
 from benchmarks.grid.run import Run, as_json, shipped_hyperparameters
 from benchmarks.grid.suites import SUITES, task_names
+from benchmarks.grid.view import Progress
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 
@@ -108,17 +109,17 @@ class Training:
         self._memory = _peak_memory(self._process.pid) or self._memory
         return self._process.poll() is None
 
-    def progress(self) -> str:
+    def progress(self) -> Progress | None:
         """
-        :return: How far training is, in a few words; empty before the first return
+        :return: How far training is; None before the first return
         """
         try:
             last = self._training_returns()[-1]
         except (IndexError, ValueError, TypeError, OSError):
-            return ""  # nothing there yet, or the line is being written
-        done = f"{last['timesteps'] / self.run.total_steps:.0%}, task {last['task_id']}, return {last['mean_return']:.0f}"
-        origin = self.attempt.origin
-        return done if origin is None else f"{done}, from {origin.num_timesteps / self.run.total_steps:.0%}"
+            return None  # nothing there yet, or the line is being written
+        share, origin = last["timesteps"] / self.run.total_steps, self.attempt.origin
+        words = f"{share:.0%}, task {last['task_id']}, return {last['mean_return']:.4g}"
+        return Progress(share, words if origin is None else f"{words}, from {origin.num_timesteps / self.run.total_steps:.0%}")
 
     @property
     def seconds_before(self) -> float:

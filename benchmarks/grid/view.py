@@ -37,6 +37,18 @@ class Failure(NamedTuple):
         return f"{self.run.name} failed: {self.reason}; see {where}{self.log}"
 
 
+class Progress(NamedTuple):
+    """
+    How far a running run is.
+
+    :param share: Share of its steps that are done
+    :param words: In a few words, with the task and the last return
+    """
+
+    share: float
+    words: str
+
+
 def duration(seconds: float) -> str:
     """
     :param seconds: A duration
@@ -66,7 +78,7 @@ class View:
         self.failures: list[Failure] = []
         self.n_before, self.n_done = n_done, n_done
         self.slots = 1
-        self.progress: dict[Run, str] = {}
+        self.progress: dict[Run, Progress] = {}
         # Seconds that running runs were trained for in earlier attempts
         self.seconds_before: dict[Run, float] = {}
         self._rates = rates
@@ -127,12 +139,22 @@ class View:
         :return: Seconds: the estimate of the rest, corrected by how long the runs that finished here really took, and divided
             by the number of runs at a time
         """
-        factor = self._real / self._estimated if self._estimated else 1.0
         # Copies, because the view is drawn by a thread of its own
-        running = [max(factor * self._rates.seconds(run) - self._seconds(run), 0.0) for run in list(self.running)]
-        waiting = [factor * self._rates.seconds(run) for run in list(self.waiting)]
+        running = [self._seconds_left(run) for run in list(self.running)]
+        waiting = [self._factor * self._rates.seconds(run) for run in list(self.waiting)]
         # No shorter than the longest of those running
         return max((sum(running) + sum(waiting)) / self.slots, max(running, default=0.0))
+
+    @property
+    def _factor(self) -> float:
+        return self._real / self._estimated if self._estimated else 1.0
+
+    def _seconds_left(self, run: Run) -> float:
+        """Of a running run, by the share that is done, and where that is not known by the rates."""
+        seconds, progress = self._seconds(run), self.progress.get(run)
+        if progress is not None:
+            return seconds * max(1 / progress.share - 1, 0.0)
+        return max(self._factor * self._rates.seconds(run) - seconds, 0.0)
 
     def render(self) -> RenderableType:
         """
@@ -146,7 +168,9 @@ class View:
         )
         running = Table.grid(padding=(0, 2))
         for run in list(self.running)[:20]:
-            running.add_row("", run.name, duration(self._seconds(run)), self.progress.get(run, ""))
+            progress, left = self.progress.get(run), f"{duration(self._seconds_left(run))} left"
+            words = "" if progress is None else progress.words
+            running.add_row("", run.name, duration(self._seconds(run)), words, left)
         if len(self.running) > 20:
             running.add_row("", f"and {len(self.running) - 20} more")
         failures = [Text(str(failure), style="red") for failure in self.failures[-5:]]

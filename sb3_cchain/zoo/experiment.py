@@ -174,7 +174,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     def _make_checkpoint_callback(self, options: CheckpointOptions) -> TrainingCheckpoint:
         assert options.freq is not None
         callback = TrainingCheckpoint(options.freq, self.checkpoint_folder, options.keep)
-        callback.advice = f"To go on from there:\n{options.resume_command(Path(self.save_path))}"
+        callback.advice = ""  # the summary says how to go on
         if self.resumed is not None:
             callback.go_on_from(self.resumed)
         return callback
@@ -222,9 +222,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         :raises SystemExit: With checkpoints, when training was stopped by SIGTERM
         """
         if self.tensorboard_log is not None:
-            folder = make_run_folder(self.tensorboard_log, type(model).__name__)
-            model.set_logger(configure(str(folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
-        self._summary = TrainingSummary(model, self.args, Path(self.save_path), self.env_name)
+            log_folder = make_run_folder(self.tensorboard_log, type(model).__name__)
+            model.set_logger(configure(str(log_folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
+        folder = Path(self.save_path)
+        go_on = None if self.checkpoints is None else self.checkpoints.resume_command(folder)
+        self._summary = TrainingSummary(model, self.args, folder, self.env_name, go_on)
         # RL Zoo's method has no place for `reset_num_timesteps`
         learn = partial(model.learn, reset_num_timesteps=False) if self.continue_training else model.learn
 

@@ -116,11 +116,13 @@ class TrainingSummary:
     :param args: RL Zoo's arguments
     :param run_folder: Where RL Zoo's files are
     :param name: The environment's name in RL Zoo's folders
+    :param resume_command: What goes on from its newest checkpoint, None without checkpoints
     """
 
-    def __init__(self, model: BaseAlgorithm, args: Namespace, run_folder: Path, name: str):
+    def __init__(self, model: BaseAlgorithm, args: Namespace, run_folder: Path, name: str, resume_command: str | None):
         assert model.env is not None
         self._model, self._args, self._folder, self._name = model, args, run_folder, name
+        self._resume_command = resume_command
         self._clock = model.env.get_attr("clock", indices=0)[0] if is_continual(model.env) else None
         self._names = task_names(model.env)
         self._first_step, self._started = model.num_timesteps, time.monotonic()
@@ -137,13 +139,16 @@ class TrainingSummary:
         _print_line(console, self._steps())
         if tasks:
             console.print(task_table(tasks, self._names))
-            _print_line(console, f"J(T), the mean over the tasks: {average_performance([task.mean_return for task in tasks]):.4g}")
+            _print_line(
+                console, f"J(T), the mean over the tasks: {average_performance([task.mean_return for task in tasks]):.4g}"
+            )
             if any(task.episodes == 0 for task in tasks):
                 _print_line(console, "Where no episode has ended, the return is the mean reward per step")
         elif episodes := self._model.ep_info_buffer:
             mean = np.mean([episode["r"] for episode in episodes])
             _print_line(console, f"Mean return of the last {len(episodes)} episodes: {mean:.4g}")
-        for title, text in {**self._places(), **self._commands()}.items():
+        places = self._places()
+        for title, text in {**places, **self._commands(places)}.items():
             _print_line(console, f"{title + ':':13}{text}")
 
     def _steps(self) -> str:
@@ -153,26 +158,37 @@ class TrainingSummary:
         return f"{self._args.algo} in {self._args.env}: {steps}, in {as_clock(seconds)}"
 
     def _places(self) -> dict[str, Path]:
-        logs = log_folder(self._model)
-        places = {
-            "Model": self._folder / f"{self._name}.zip",
-            "Best model": self._folder / "best_model.zip",
-            "Checkpoint": max((self._folder / CHECKPOINTS).glob("step_*"), default=self._folder / CHECKPOINTS),
-            **({} if logs is None else {"TensorBoard": logs, "Returns": logs / RETURNS_CSV}),
-        }
+        places = {"Model": self._folder / f"{self._name}.zip", "Best model": self._folder / "best_model.zip"}
+        if checkpoints := sorted((self._folder / CHECKPOINTS).glob("step_*")):
+            places["Checkpoint"] = checkpoints[-1]
+        if (logs := log_folder(self._model)) is not None:
+            places.update({"TensorBoard": logs, "Returns": logs / RETURNS_CSV})
         return {title: path for title, path in places.items() if path.exists()}
 
-    def _commands(self) -> dict[str, str]:
+    def _commands(self, places: Mapping[str, Path]) -> dict[str, str]:
         args, commands = self._args, {}
         number = self._folder.name.rpartition("_")[2]
-        if (self._folder / f"{self._name}.zip").exists() and number.isdecimal():  # RL Zoo does not find a folder with a uuid
-            command = ["sb3-cchain", "enjoy", "--algo", args.algo, "--env", args.env, "-f", args.log_folder, "--exp-id", number]
+        if "Model" in places and number.isdecimal():  # RL Zoo does not find a folder that ends in a uuid
+            command = [
+                "sb3-cchain",
+                "enjoy",
+                "--algo",
+                args.algo,
+                "--env",
+                args.env,
+                "-f",
+                args.log_folder,
+                "--exp-id",
+                number,
+            ]
             if self._clock is not None:
                 last = max(task_ends([], self._clock, self._model.num_timesteps))
                 command += ["--env-kwargs", f"first_task:{last}"] if last else []
             commands["Watch it"] = shlex.join(command)
-        if args.tensorboard_log:
+        if "TensorBoard" in places:
             commands["See curves"] = shlex.join(["tensorboard", "--logdir", args.tensorboard_log])
+        if "Checkpoint" in places and self._resume_command and self._model.num_timesteps < self._model._total_timesteps:
+            commands["Go on"] = self._resume_command
         return commands
 
 
