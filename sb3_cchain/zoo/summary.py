@@ -4,7 +4,6 @@ import shlex
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,7 +99,7 @@ def task_table(tasks: Sequence[TaskSummary], names: Sequence[str]) -> Table:
     """
     table = Table(box=box.ASCII)
     for title in ("task", *(("name",) if names else ()), "steps", "episodes", "mean return", "last episodes"):
-        table.add_column(title, justify="left" if title == "name" else "right", no_wrap=True)
+        table.add_column(title, justify="left" if title == "name" else "right", no_wrap=title != "name", overflow="fold")
     for task in tasks:
         name = (names[task.task_id],) if names else ()
         returns = (f"{value:.4g}" for value in (task.mean_return, task.last_return))
@@ -121,6 +120,7 @@ class TrainingSummary:
 
     def __init__(self, model: BaseAlgorithm, args: Namespace, run_folder: Path, name: str, resume_command: str | None):
         assert model.env is not None
+        self._env = model.env
         self._model, self._args, self._folder, self._name = model, args, run_folder, name
         self._resume_command = resume_command
         self._clock = model.env.get_attr("clock", indices=0)[0] if is_continual(model.env) else None
@@ -132,7 +132,7 @@ class TrainingSummary:
         :param console: Where to
         """
         console = console or Console()
-        if active_signal(self._model.env) is not None:  # which numbers the tasks in its own way
+        if active_signal(self._env) is not None:  # which numbers the tasks in its own way
             self._clock, self._names = None, []
         rows = getattr(self._model, "continual_returns", [])
         tasks = summarise_tasks(rows, task_ends(rows, self._clock, self._model.num_timesteps))

@@ -1,0 +1,88 @@
+"""What ``sb3-cchain train`` says at its end."""
+
+import io
+import shlex
+
+import pytest
+from rich.console import Console
+
+from sb3_cchain.tasks.clock import TaskClock
+from sb3_cchain.zoo.summary import TaskSummary, summarise_tasks, task_ends, task_table
+from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
+
+COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
+ROWS = [
+    dict(zip(COLUMNS, row, strict=True))
+    for row in [(800, 0, 4, 10.0), (1600, 0, 8, 40.0), (2400, 0, 4, 10.0), (3200, 1, 12, 50.0), (3500, 2, 0, -1.0)]
+]
+TASKS = [
+    # The last twelve episodes: 8 of 40 and 4 of 10. The mean over rollouts is another one than over episodes
+    TaskSummary(0, 2500, 16, 20.0, 30.0),
+    TaskSummary(1, 1000, 12, 50.0, 50.0),
+    TaskSummary(2, 500, 0, -1.0, -1.0),
+]
+
+
+def test_tasks_by_hand():
+    assert summarise_tasks(ROWS, {0: 2500, 1: 3500, 2: 4000}) == TASKS
+
+
+@pytest.mark.parametrize(
+    "clock, num_timesteps, ends",
+    [
+        (TaskClock([2500, 1000, 900]), 4000, {0: 2500, 1: 3500, 2: 4000}),
+        (TaskClock([2500, 1000, 900]), 2500, {0: 2500}),  # the second has not begun
+        (TaskClock([100, 2500, 1000], first_task=1), 2600, {1: 2500, 2: 2600}),
+        (None, 4000, {0: 2400, 1: 3200, 2: 4000}),
+    ],
+)
+def test_where_tasks_end_by_hand(clock, num_timesteps, ends):
+    assert task_ends(ROWS, clock, num_timesteps) == ends
+
+
+def test_the_table_fits_a_terminal():
+    console = Console(file=io.StringIO(), width=80)
+    console.print(task_table([TASKS[0]._replace(steps=5_000_000, episodes=100_000)], ["MiniGrid-DoorKey-16x16-v0"]))
+    shown = console.file.getvalue().splitlines()
+    assert [part.strip() for part in shown[3].split("|")[3:7]] == ["5,000,000", "100,000", "20", "30"]
+    name = "".join(line.split("|")[2].strip() for line in shown[3:-1])  # on several lines
+    assert name == "MiniGrid-DoorKey-16x16-v0" and max(map(len, shown)) <= 80
+
+
+def train(folder, capsys, env, *arguments):
+    command(
+        *("train", "--algo", "ppo_cchain", "--env", env, "-f", folder / "logs", "--seed", "0", *FAST, *NO_EVALUATION),
+        *(*arguments, *SHORT_PPO),
+    )
+    lines = capsys.readouterr().out.splitlines()
+    return lines[next(number for number, line in enumerate(lines) if line.startswith("ppo_cchain in")) :]
+
+
+def test_the_end_of_training(tmp_path, capsys):
+    arguments = ("-n", 160, "-tb", tmp_path / "tb", "-P", "--checkpoint-freq", 64)
+    shown = train(tmp_path, capsys, "Continual/CartPole-v1", *arguments, "--env-kwargs", "n_tasks:3", "steps_per_task:64")
+    assert shown[0].startswith("ppo_cchain in Continual/CartPole-v1: step 160 of 160, in 0:00:")
+    assert [line.split("|")[1:3] for line in shown[4:7]] == [
+        ["    0 ", "    64 "],
+        ["    1 ", "    64 "],
+        ["    2 ", "    32 "],
+    ]
+    assert shown[8].startswith("J(T), the mean over the tasks: ")
+    where = dict(line.split(":", 1) for line in shown[9:])
+    run, logs = tmp_path / "logs/ppo_cchain/Continual-CartPole-v1_1", tmp_path / "tb/Continual-CartPole-v1/CChainPPO_1"
+    assert {title: text.strip() for title, text in where.items()} == {
+        "Model": f"{run}/Continual-CartPole-v1.zip",
+        "Checkpoint": f"{run}/checkpoints/step_000000000128",
+        "TensorBoard": str(logs),
+        "Returns": f"{logs}/returns.csv",
+        "Watch it": "sb3-cchain enjoy --algo ppo_cchain --env Continual/CartPole-v1 "
+        f"-f {tmp_path}/logs --exp-id 1 --env-kwargs first_task:2",
+        "See curves": f"tensorboard --logdir {tmp_path}/tb",
+    }
+    command(*shlex.split(where["Watch it"])[1:], "--no-render", "-n", 5)
+
+
+def test_the_end_of_training_without_tasks(tmp_path, capsys):
+    shown = train(tmp_path, capsys, "CartPole-v1", "-n", 64)
+    assert shown[1].startswith("Mean return of the last 2 episodes: ")
+    assert [line.split(":")[0] for line in shown[2:]] == ["Model", "Watch it"]
