@@ -52,6 +52,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     - Checkpoints, the best and the final model are whole or absent. They come with the statistics of ``VecNormalize``.
     - Training from a saved model (``-i``) goes on at its step, its task and its statistics.
     - Training with checkpoints (``--checkpoint-freq``) goes on exactly (``--resume``).
+    - The progress bar (``-P``) shows the tasks, and training ends with a summary.
     - ``-optimize`` searches the grids of the related methods.
 
     :param args: Arguments of RL Zoo's
@@ -216,17 +217,16 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        Train a model. One that was loaded goes on counting its steps. With checkpoints, SIGTERM ends it with the summary.
+        Train a model. One that was loaded goes on counting its steps.
 
         :param model: The model
         :raises SystemExit: With checkpoints, when training was stopped by SIGTERM
         """
         if self.tensorboard_log is not None:
-            log_folder = make_run_folder(self.tensorboard_log, type(model).__name__)
-            model.set_logger(configure(str(log_folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
-        folder = Path(self.save_path)
-        go_on = None if self.checkpoints is None else self.checkpoints.resume_command(folder)
-        self._summary = TrainingSummary(model, self.args, folder, self.env_name, go_on)
+            folder = make_run_folder(self.tensorboard_log, type(model).__name__)
+            model.set_logger(configure(str(folder), ["stdout", "tensorboard"] if self.verbose > 0 else ["tensorboard"]))
+        go_on = None if self.checkpoints is None else self.checkpoints.resume_command(Path(self.save_path))
+        self._summary = TrainingSummary(model, self.args, Path(self.save_path), self.env_name, go_on)
         # RL Zoo's method has no place for `reset_num_timesteps`
         learn = partial(model.learn, reset_num_timesteps=False) if self.continue_training else model.learn
 
@@ -236,19 +236,16 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             except KeyboardInterrupt:  # which RL Zoo takes for the end
                 self._was_interrupted = True
                 raise
-            except SystemExit:  # by SIGTERM, with checkpoints: no model is saved
-                self._close_progress_bar()
-                self._summary.print()
-                raise
             finally:
-                self._close_progress_bar()
+                for callback in self.callbacks:
+                    if isinstance(callback, TaskProgressBar):
+                        callback.close()  # at once, before what follows is printed
 
-        super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
-
-    def _close_progress_bar(self) -> None:
-        for callback in self.callbacks:
-            if isinstance(callback, TaskProgressBar):
-                callback.close()
+        try:
+            super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
+        except SystemExit:  # by SIGTERM, with checkpoints: no model is saved
+            self._summary.print()
+            raise
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
