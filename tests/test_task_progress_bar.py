@@ -103,7 +103,7 @@ def test_it_follows_the_environment(bar, cls, n_envs):
     words = {steps: words for steps, (words, _) in look.seen.items()}
     assert words[30].startswith("task 0 (1 of 3) count one, next in 2 steps (")
     assert words[32].startswith("task 1 (2 of 3) count two, next in 32 steps (") and "return" not in words[32]
-    assert words[80] == f"task 2 (3 of 3) count three, return 21"
+    assert words[80] == "task 2 (3 of 3) count three, return 21"
 
 
 def test_chunks_and_first_task(bar):

@@ -44,6 +44,7 @@ class TaskProgressBar(BaseCallback):
     def __init__(self) -> None:
         super().__init__()
         self._live: Live | None = None
+        self._lock = threading.RLock()
         self._closed = threading.Event()
 
     def state_dict(self) -> dict[str, Any]:
@@ -84,20 +85,22 @@ class TaskProgressBar(BaseCallback):
 
     def _draw(self, closed: threading.Event, call: LearnCall) -> None:
         while not closed.wait(SECONDS_BETWEEN_DRAWINGS):
-            if call.is_over():
-                self.close()
-            elif self._live is not None:
-                self._live.refresh()
+            with self._lock:
+                if call.is_over():
+                    self.close()
+                elif self._live is not None:
+                    self._live.refresh()
 
     def close(self) -> None:
         """Close the bar, which happens by itself when ``learn()`` ends."""
-        self._closed.set()
-        live, self._live = self._live, None
-        if live is not None:
-            live.stop()
-            if not live.console.is_terminal:
-                live.console.line()
-            atexit.unregister(self.close)
+        with self._lock:
+            self._closed.set()
+            live, self._live = self._live, None
+            if live is not None:
+                live.stop()
+                if not live.console.is_terminal:
+                    live.console.line()
+        atexit.unregister(self.close)
 
     def _on_rollout_start(self) -> None:
         self._present = (self.num_timesteps, time.monotonic())
@@ -122,24 +125,26 @@ class TaskProgressBar(BaseCallback):
         :param step: Environment steps
         :return: Seconds until training is there, by the speed so far; None in the first rollout, when it is not known
         """
-        present_step, present_time = self._present
-        if self.steps_per_second is None:
+        speed, (present_step, present_time) = self.steps_per_second, self._present
+        if speed is None:
             return None
-        return max((step - present_step) / self.steps_per_second - (time.monotonic() - present_time), 0.0)
+        return max((step - present_step) / speed - (time.monotonic() - present_time), 0.0)
 
     @property
     def steps_per_second(self) -> float | None:
         """Environment steps per second of whole rollouts with their updates; None in the first rollout."""
-        if self._first is None or self._first[0] == self._present[0]:
+        first_step, first_time = self._first or self._present
+        present_step, present_time = self._present
+        if present_step == first_step or present_time == first_time:
             return None
-        return (self._present[0] - self._first[0]) / (self._present[1] - self._first[1])
+        return (present_step - first_step) / (present_time - first_time)
 
     def render(self) -> RenderableType:
         """
         :return: What the bar shows now
         """
         step, total = self.model.num_timesteps, self.locals["total_timesteps"]
-        speed = "-" if self.steps_per_second is None else f"{self.steps_per_second:,.0f}"
+        speed = self.steps_per_second
         elapsed, left = as_clock(time.monotonic() - self._started), as_clock(self.seconds_to(total))
         bar = Table.grid(padding=(0, 1), expand=True)
         bar.add_column()
@@ -148,7 +153,7 @@ class TaskProgressBar(BaseCallback):
         bar.add_row(
             f"{min(step / total, 1):4.0%}",
             ProgressBar(total=total, completed=step),
-            f"{step:,}/{total:,} {elapsed} < {left}, {speed} steps/s",
+            f"{step:,}/{total:,} {elapsed} < {left}, {'-' if speed is None else f'{speed:,.0f}'} steps/s",
         )
         words = self.describe()
         return Group(Text(words, no_wrap=True, overflow="ellipsis"), bar) if words else bar
