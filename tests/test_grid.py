@@ -24,6 +24,7 @@ from benchmarks.grid.plan import Rates, grid_runs, run_length
 from benchmarks.grid.ray_backend import RayBackend, count_slots
 from benchmarks.grid.results import METRIC_PREFIXES, RENAMED, Result, find_result, read_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run, as_json, make_run, other_beta, paper_methods, split_line, suite_methods
+from benchmarks.grid.scores import score_table
 from benchmarks.grid.suites import SUITES, task_names
 from benchmarks.grid.training import metrics_rows
 from benchmarks.grid.view import Failure, Progress, View, duration
@@ -398,7 +399,20 @@ def test_dry_run(tmp_path, capsys, monkeypatch):
     # Nothing to do needs no Ray
     write_result(make_result(tmp_path, replace(RUN, method="vanilla")), ROWS, [])
     assert main(arguments) == 0
-    assert capsys.readouterr().out.startswith("All 2 runs are done.")
+    shown = capsys.readouterr().out
+    assert shown.startswith("All 2 runs are done.") and "Report:  python -m benchmarks.report --budget smoke" in shown
+
+
+def test_scores_by_hand(tmp_path):
+    """J(T) is 25 and 5 of the one method, and -1 of the other."""
+    returns = {("cchain", 0): (20.0, 30.0), ("cchain", 1): (10.0, 0.0), ("vanilla", 0): (-3.0, 1.0)}
+    for (method, seed), task_returns in returns.items():
+        rows = [{**ROWS[0], "task_id": task, "mean_return": value} for task, value in enumerate(task_returns)]
+        write_result(make_result(tmp_path, replace(RUN, method=method, seed=seed)), rows, [])
+    console = Console(record=True, width=80)
+    console.print(score_table(read_results(tmp_path)[0]))
+    shown = [line.replace("|", " ").split() for line in console.export_text().splitlines()]
+    assert sorted(shown[3:-1]) == [["CartPole-v1", "cchain", "2", "15", "10"], ["CartPole-v1", "vanilla", "1", "-1"]]
 
 
 # --- Time ---------------------------------------------------------------------------------------------------------------
