@@ -83,12 +83,11 @@ def task_ends(rows: Sequence[Mapping[str, float]], clock: TaskClock | None, num_
     """
     if clock is None:
         ends = {int(row["task_id"]): int(row["timesteps"]) for row in rows}
+        present = max(ends, default=0)
     else:
         ends = dict(enumerate([step for step in clock.switches if step < num_timesteps], start=clock.first_task))
-        ends[clock.first_task + len(ends)] = num_timesteps
-    if ends:
-        ends[list(ends)[-1]] = num_timesteps
-    return ends
+        present = clock.first_task + len(ends)
+    return {**ends, present: num_timesteps}
 
 
 def task_table(tasks: Sequence[TaskSummary], names: Sequence[str]) -> Table:
@@ -139,9 +138,8 @@ class TrainingSummary:
         _print_line(console, self._steps())
         if tasks:
             console.print(task_table(tasks, self._names))
-            _print_line(
-                console, f"J(T), the mean over the tasks: {average_performance([task.mean_return for task in tasks]):.4g}"
-            )
+            performance = average_performance([task.mean_return for task in tasks])
+            _print_line(console, f"J(T), the mean over the tasks: {performance:.4g}")
             if any(task.episodes == 0 for task in tasks):
                 _print_line(console, "Where no episode has ended, the return is the mean reward per step")
         elif episodes := self._model.ep_info_buffer:
@@ -169,21 +167,11 @@ class TrainingSummary:
         args, commands = self._args, {}
         number = self._folder.name.rpartition("_")[2]
         if "Model" in places and number.isdecimal():  # RL Zoo does not find a folder that ends in a uuid
-            command = [
-                "sb3-cchain",
-                "enjoy",
-                "--algo",
-                args.algo,
-                "--env",
-                args.env,
-                "-f",
-                args.log_folder,
-                "--exp-id",
-                number,
-            ]
-            if self._clock is not None:
-                last = max(task_ends([], self._clock, self._model.num_timesteps))
-                command += ["--env-kwargs", f"first_task:{last}"] if last else []
+            command = ["sb3-cchain", "enjoy", "--algo", args.algo, "--env", args.env, "-f", args.log_folder]
+            command += ["--exp-id", number]
+            last = 0 if self._clock is None else max(task_ends([], self._clock, self._model.num_timesteps))
+            if last > 0 and args.env.startswith("Continual/"):  # other environments may not have the argument
+                command += ["--env-kwargs", f"first_task:{last}"]
             commands["Watch it"] = shlex.join(command)
         if "TensorBoard" in places:
             commands["See curves"] = shlex.join(["tensorboard", "--logdir", args.tensorboard_log])
