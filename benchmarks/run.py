@@ -26,7 +26,7 @@ from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs, shelf_runs
 from benchmarks.grid.results import find_result, read_result, read_results
 from benchmarks.grid.run import Run
-from benchmarks.grid.scores import score_table
+from benchmarks.grid.score_table import score_table
 from benchmarks.grid.suites import SUITES
 from benchmarks.grid.view import duration
 from sb3_cchain.checkpoint import check_writable

@@ -24,7 +24,7 @@ from benchmarks.grid.plan import Rates, grid_runs, run_length
 from benchmarks.grid.ray_backend import RayBackend, count_slots
 from benchmarks.grid.results import METRIC_PREFIXES, RENAMED, Result, find_result, read_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run, as_json, make_run, other_beta, paper_methods, split_line, suite_methods
-from benchmarks.grid.scores import score_table
+from benchmarks.grid.score_table import score_table
 from benchmarks.grid.suites import SUITES, task_names
 from benchmarks.grid.training import metrics_rows
 from benchmarks.grid.view import Failure, Progress, View, duration
