@@ -1,6 +1,7 @@
 """The task on the frames of a video."""
 
 import sys
+from functools import partial
 from unittest import mock
 
 import gymnasium as gym
@@ -71,6 +72,19 @@ def test_the_caption_is_in_the_corner(size):
     assert frame.max() > 200 and frame.min() == 0  # white on black, smoothed
     if min(size) > 90:
         assert rows.max() < size[0] / 5 and columns.max() < size[1] * 0.6
+
+
+def test_all_frames_have_the_size_of_the_first():
+    tasks = [partial(GreyEnv, size=size) for size in ((80, 120), (200, 200))]
+    env = TaskCaption(ContinualEnv(tasks, 1, render_mode="rgb_array"))
+    env.reset()
+    assert env.render().shape == (80, 120, 3)
+    env.step(0)
+    env.reset()
+    frame = env.render()
+    assert frame.shape == (80, 120, 3)
+    # Below the caption: 80 x 80 in the middle, and 20 black columns on either side
+    assert (frame[-1, :20] == 0).all() and (frame[-1, 20:100] == 128).all() and (frame[-1, 100:] == 0).all()
 
 
 def test_without_a_task_the_frame_stays():

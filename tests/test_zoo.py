@@ -10,6 +10,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import Autoreset
 from rl_zoo3 import ALGOS
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common import buffers, callbacks
@@ -23,7 +24,8 @@ import sb3_cchain.zoo.__main__ as console
 import sb3_cchain.zoo.cli as zoo
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
-from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.envs import RewardScale, TaskCaption, TaskVecNormalize
+from sb3_cchain.envs.task_caption import with_caption
 from sb3_cchain.methods.registry import REGISTRY
 from tests.zoo_command import FAST, NO_EVALUATION, ROOT, SHORT_PPO, command, run, stock_train
 
@@ -266,33 +268,50 @@ def test_playing_a_torn_model_names_the_file(tmp_path):
         command("enjoy", "--algo", "ppo_cchain", "--env", "CartPole-v1", "-f", tmp_path, "--exp-id", "-1", "--no-render")
 
 
-class NoVideo(VecEnvWrapper):
+class Frames(VecEnvWrapper):
     """In the place of the recorder, which needs moviepy."""
-
-    made = None
 
     def __init__(self, venv, folder, **kwargs):
         super().__init__(venv)
-        NoVideo.made, self.n_steps = (folder, kwargs["name_prefix"]), 0
+        self.path, self.frames = f"{folder}/{kwargs['name_prefix']}", []
 
     def reset(self):
         return self.venv.reset()
 
     def step_wait(self):
-        self.n_steps += 1
-        return self.venv.step_wait()
-
-    def close(self):
-        NoVideo.made += (self.n_steps,)
-        self.venv.close()
+        step = self.venv.step_wait()
+        self.frames.append(self.venv.render())
+        return step
 
 
-def test_record_video(tmp_path, monkeypatch):
-    monkeypatch.setattr("stable_baselines3.common.vec_env.VecVideoRecorder", NoVideo)
+def test_record_video_has_the_task_on_each_frame(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "stable_baselines3.common.vec_env.VecVideoRecorder",
+        lambda *args, **kwargs: made.append(Frames(*args, **kwargs)) or made[-1],
+    )
     CChainPPO("MlpPolicy", "Continual/CartPole-v1", device="cpu").save(tmp_path / "ppo_cchain" / "Continual-CartPole-v1.zip")
-    arguments = ("--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-f", tmp_path, "--exp-id", "-1", "-n", "3")
-    command("record_video", *arguments, "-o", tmp_path / "videos", "--no-render")
-    assert NoVideo.made == (str(tmp_path / "videos"), "final-model-ppo_cchain-Continual-CartPole-v1", 3)
+    arguments = ("--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-f", tmp_path, "--exp-id", "-1", "-n", "4")
+    command("record_video", *arguments, "-o", tmp_path / "videos", "--no-render", "--env-kwargs", "steps_per_task:2")
+    (video,) = made
+    assert video.path == str(tmp_path / "videos" / "final-model-ppo_cchain-Continual-CartPole-v1")
+    # When a step has ended a task, the environment is already at the next
+    for frame, task in zip(video.frames, (0, 1, 1, 2), strict=True):
+        assert np.array_equal(frame, with_caption(frame, f"task {task}"))
+
+
+@pytest.mark.parametrize(
+    "settings, wrapper",
+    [
+        ({}, TaskCaption),
+        (dict(env_wrapper=None), TaskCaption),
+        (dict(env_wrapper="gymnasium.wrappers.Autoreset"), Autoreset),
+        (dict(env_wrapper=[{"sb3_cchain.envs.RewardScale": {"scale": 2.0}}]), RewardScale),
+    ],
+)
+def test_what_is_filmed_keeps_the_wrappers_of_the_settings(settings, wrapper):
+    env = zoo.create_captioned_env("Continual/CartPole-v1", hyperparams=settings, env_kwargs=dict(render_mode="rgb_array"))
+    assert env.env_is_wrapped(wrapper) == env.env_is_wrapped(TaskCaption) == [True]
 
 
 def test_record_training_records_by_our_command(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Writes the task on the frames of a video."""
+"""Frames for a video of several tasks."""
 
 from typing import Any, SupportsFloat
 
@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.core import ActType, ObsType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from sb3_cchain.tasks.signal import TASK_KEY
 
@@ -17,7 +17,8 @@ _LETTERS, _LEAST_LETTERS = 1 / 16, 10
 
 class TaskCaption(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstructorArgs):
     """
-    Writes the task in the upper left corner of each frame, for a video of an agent across a switch. Nothing else changes.
+    Writes the task in the upper left corner of each frame, for a video of an agent across a switch. A video has one size:
+    where frames of a later task have another size than the first frame, they are scaled to fit into it, with black margins.
 
     :param env: Environment with ``render_mode="rgb_array"``
     :param key: The entry of ``info`` that says the task. Frames are as they were where it is missing
@@ -31,6 +32,7 @@ class TaskCaption(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstru
             raise ValueError(f'TaskCaption needs an environment with `render_mode="rgb_array"`, got {env.render_mode!r}')
         self.key = key
         self._task: Any = None
+        self._size: tuple[int, int] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ObsType, dict[str, Any]]:
         """
@@ -56,6 +58,10 @@ class TaskCaption(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstru
         :return: The frame with the task on it, ``(height, width, 3)``, ``uint8``
         """
         frame = np.asarray(self.env.render())
+        height, width, _ = frame.shape
+        self._size = self._size or (width, height)
+        if (width, height) != self._size:
+            frame = np.asarray(ImageOps.pad(Image.fromarray(frame), self._size))
         return frame if self._task is None else with_caption(frame, f"task {self._task}")
 
 

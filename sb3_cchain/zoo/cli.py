@@ -13,6 +13,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 try:
     import rl_zoo3.train
@@ -24,6 +25,7 @@ except ImportError as error:
     raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
 from sb3_cchain.checkpoint import check_model_file
+from sb3_cchain.envs import TaskCaption
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo import inspect as zoo_inspect
@@ -41,6 +43,7 @@ MODULES = ("record_video", "record_training", "benchmark", "load_from_hub", "pus
 PLAYING = ("enjoy", "record_video", "push_to_hub")
 
 _RL_ZOO_ALGOS = dict(ALGOS)
+_create_test_env = rl_zoo3.utils.create_test_env
 
 
 def register_algorithms(playing: bool = False) -> None:
@@ -69,6 +72,20 @@ def for_playing(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
         return algorithm.load(path, *args, **kwargs)
 
     return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
+
+
+def create_captioned_env(env_id: str, hyperparams: dict[str, Any], **kwargs: Any) -> VecEnv:
+    """
+    RL Zoo's ``create_test_env``, with the task on each frame.
+
+    :param env_id: Environment id
+    :param hyperparams: Settings of the training
+    :param kwargs: Other arguments of RL Zoo's
+    :return: The vectorised environment
+    """
+    wrappers = hyperparams.get("env_wrapper") or []
+    wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
+    return _create_test_env(env_id, hyperparams={**hyperparams, "env_wrapper": [*wrappers, TaskCaption]}, **kwargs)
 
 
 def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
@@ -163,6 +180,7 @@ def run_module(name: str) -> None:
     with (
         replaced(subprocess, "call", call_sb3_cchain),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
+        replaced(rl_zoo3.utils, "create_test_env", create_captioned_env if name == "record_video" else _create_test_env),
         working_clients() if name.endswith("_hub") else nullcontext(),
         warnings.catch_warnings(),
     ):
