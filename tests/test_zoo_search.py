@@ -6,7 +6,7 @@ import numpy as np
 import optuna
 import pytest
 from rl_zoo3 import ALGOS
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import A2C, PPO, SAC
 
 import sb3_cchain.methods
 import sb3_cchain.zoo.cli as zoo
@@ -89,6 +89,37 @@ def test_trial_id_is_refused_for_grids(method):
     search.register_search_spaces()
     with pytest.raises(ValueError, match=r"`--trial-id`.*'coef': 0.1.*-conf"):
         search.HYPERPARAMS_CONVERTER[method.algo]({"coef": 0.1})
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A study of A2C with two trials, γ 0.99 and 0.98: its storage and its name."""
+    path = str(tmp_path / "study.log")
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(path))
+    study = optuna.create_study(storage=storage, study_name="mine")
+    for one_minus_gamma in (0.01, 0.02):
+        study.enqueue_trial({"one_minus_gamma": one_minus_gamma})
+        trial = study.ask()
+        search.HYPERPARAMS_SAMPLER["a2c"](trial, 0, 1, {})
+        study.tell(trial, 0.0)
+    return ["--storage", path, "--study-name", "mine"]
+
+
+TRAIN_A2C = ("train", "--algo", "a2c", "--env", "CartPole-v1", "-n", "16", *FAST, *NO_EVALUATION)
+
+
+@pytest.mark.parametrize("trial, gamma", [(0, 0.99), (1, 0.98)])
+def test_trains_with_the_values_of_any_trial(tmp_path, study, trial, gamma):
+    command(*TRAIN_A2C, "-f", tmp_path, *study, "--trial-id", trial, "-params", "n_steps:8", "max_grad_norm:0.25")
+    model = A2C.load(tmp_path / "a2c" / "CartPole-v1_1" / "CartPole-v1.zip", device="cpu")
+    assert (model.gamma, model.n_steps, model.max_grad_norm) == (pytest.approx(gamma), 8, 0.25)
+
+
+def test_a_trial_that_is_not_there_is_named(tmp_path, study):
+    with pytest.raises(SystemExit, match=r"--trial-id 2: the study mine in .* has no such trial"):
+        command(*TRAIN_A2C, "-f", tmp_path, *study, "--trial-id", 2)
+    with pytest.raises(SystemExit, match="--trial-id 0 is a trial of a study: give its --storage"):
+        command(*TRAIN_A2C, "-f", tmp_path, "--trial-id", 0)
 
 
 @pytest.mark.parametrize("option", [[], ["-conf", "mine.yml"]])

@@ -77,10 +77,31 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
         :return: The hyperparameters, twice: for use and as they are saved
+        :raises SystemExit: When ``--trial-id`` is given without the study
         """
+        if self.trial_id is not None:
+            if not (self.storage and self.study_name):
+                sys.exit(f"--trial-id {self.trial_id} is a trial of a study: give its --storage and --study-name, too")
+            if self.trial_id == 0:  # RL Zoo takes it for none
+                values = self.load_trial(self.storage, self.study_name, trial_id=0)
+                self.custom_hyperparams = {**values, **(self.custom_hyperparams or {})}
         hyperparams, saved = super().read_hyperparameters()
         self._hyperparameters_read = plain(saved)  # what follows changes parts of them in place
         return hyperparams, saved
+
+    def load_trial(self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> dict[str, Any]:
+        """
+        :param storage: Where the study is
+        :param study_name: Name of the study
+        :param trial_id: The trial, counted from 0; None for the best one
+        :param convert: Whether its values become hyperparameters of the algorithm
+        :return: Its hyperparameters
+        :raises SystemExit: When there is no such study or trial, or the trial has no values
+        """
+        try:
+            return super().load_trial(storage, study_name, trial_id, convert)
+        except (IndexError, KeyError):
+            sys.exit(f"--trial-id {trial_id}: the study {study_name} in {storage} has no such trial with values")
 
     def create_log_folder(self) -> None:
         """
