@@ -38,6 +38,7 @@ CONTENTS = {
         "modules/doctor",
         "Monitors and inspection <modules/analysis>",
         "metrics",
+        "trackers",
         "callbacks",
         "resume",
         "zoo",
