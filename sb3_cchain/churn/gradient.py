@@ -10,7 +10,7 @@ from sb3_cchain.replaced import replaced
 
 
 @contextmanager
-def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], None]) -> Iterator[None]:
+def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], object]) -> Iterator[None]:
     """
     Call ``backward()`` right after each ``optimizer.zero_grad()`` inside the ``with`` block.
 

@@ -59,7 +59,7 @@ class FlatDMControl(gym.Wrapper, RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         return self._flatten(observation), info
 
-    def step(self, action: NDArray[np.floating]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
         """
         :param action: The action; values out of bounds are clipped
         :return: Observation, reward, terminated, truncated, info
@@ -69,7 +69,7 @@ class FlatDMControl(gym.Wrapper, RecordConstructorArgs):
         return self._flatten(observation), float(reward), terminated, truncated, info
 
 
-class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating]]):
+class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating[Any]]]):
     """
     Continual DeepMind Control (Section 5 of the C-CHAIN paper): a task is another goal of the same robot.
 

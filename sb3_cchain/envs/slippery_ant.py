@@ -12,7 +12,7 @@ from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_number
 
 
-class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating]]):
+class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating[Any]]]):
     """
     Slippery Ant (Dohare et al., "Loss of plasticity in deep continual learning", Nature 2024,
     https://doi.org/10.1038/s41586-024-07711-7): a task is a friction between the robot and the floor, drawn log-uniformly.

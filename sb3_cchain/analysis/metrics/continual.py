@@ -15,11 +15,12 @@ https://arxiv.org/abs/1706.08840).
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.floating]
+Array = NDArray[np.floating[Any]]
 
 # --- From the returns of training ---------------------------------------------------------------------------------------
 
