@@ -7,7 +7,7 @@ SUITE = gym_control
 # What the demo needs: its own extra and, elsewhere than in Gym Control, that of the suite. `dev` holds all of them
 DEMO_EXTRAS = $(if $(wildcard $(VENV)/.installed-dev),dev,$(if $(filter gym_control,$(SUITE)),demo,demo,$(SUITE)))
 
-.PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc dist clean
+.PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc linkcheck dist clean
 
 # --- The two commands of the README -------------------------------------------------------------------------------------
 
@@ -57,6 +57,10 @@ commit-checks: format type lint
 
 doc: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W -b html docs docs/_build/html
+
+# Needs a network
+linkcheck: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -q -b linkcheck docs docs/_build/linkcheck
 
 dist: $(VENV)/.installed-release
 	rm -rf dist

@@ -25,6 +25,8 @@ html_css_files = ["wide.css"]
 html_show_sphinx = False
 exclude_patterns = ["_build"]
 nitpicky = False
+linkcheck_anchors = False  # GitHub makes them in the browser
+linkcheck_timeout = 10
 
 # Captions of the sidebar, and the pages below them, some with a shorter title
 CONTENTS = {

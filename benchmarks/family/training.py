@@ -2,12 +2,14 @@
 
 import csv
 import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from copy import deepcopy
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -89,7 +91,9 @@ def train_all(runs: Sequence[Run], n_jobs: int) -> Iterator[Run]:
     if n_jobs == 1:
         yield from map(train, waiting)
         return
-    with ProcessPoolExecutor(n_jobs, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+    # A process for each run, where Python can
+    fresh: dict[str, Any] = {"max_tasks_per_child": 1} if sys.version_info >= (3, 11) else {}
+    with ProcessPoolExecutor(n_jobs, mp_context=get_context("spawn"), **fresh) as pool:
         for done in as_completed([pool.submit(train, run) for run in waiting]):
             yield done.result()
 
