@@ -17,7 +17,7 @@ from benchmarks.report.verdicts import AGREES, DISAGREES, verdict
 def method_label(suite: str, method: str) -> str:
     """
     :param suite: Name of a suite
-    :param method: Name of a method, also with another β
+    :param method: Name of a method, also with another strength
     :return: The method's label in that suite
     """
     return suite_lines(suite, [method])[method].label
@@ -27,7 +27,7 @@ def table_methods(cells: Cells, paper: Table) -> list[str]:
     """
     :param cells: Cells of a suite
     :param paper: The paper's table
-    :return: The methods that are in either, also with another β, in the order of the tables
+    :return: The methods that are in either, also with another strength, in the order of the tables
     """
     return lines_in_order([*paper.methods, *(line for _, line in cells)])
 
