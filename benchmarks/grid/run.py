@@ -212,8 +212,8 @@ def shortest(number: float) -> str:
 def other_strength(run: Run) -> dict[str, Any]:
     """
     :param run: A run
-    :return: The hyperparameter that holds the strength of its method, of a run that differs from the shipped hyperparameters in
-        that strength alone and is named so; empty for every other run
+    :return: The hyperparameter that holds the strength of its method, of a run that differs from the shipped
+        hyperparameters in that strength alone and is named so; empty for every other run
     """
     try:
         method, strength = split_line(run.variant or "")

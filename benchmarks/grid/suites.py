@@ -137,8 +137,8 @@ SUITES = {
         evaluation=Evaluation(per_task=50, deterministic=False, least_interval=20_000),
         score=Score(
             EVALUATION,
-            "The released code evaluates on the task being trained every 20,000 steps, by ten episodes with sampled actions and "
-            "the statistics of training. Whether the paper's numbers are of these or of the episodes of training is not known.",
+            "The released code evaluates on the task being trained every 20,000 steps, by ten episodes with sampled actions "
+            "and the statistics of training. Whether the paper's numbers are of these or of training is not known.",
         ),
     ),
     "minatar": Suite(

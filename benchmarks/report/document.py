@@ -79,8 +79,9 @@ READING = """\
 
 
 RELEASED_WORDS = """\
-{rule} Both scores, of the cells all of whose runs logged it; the other tables of this page have the episodes that ended in a
-rollout."""
+{rule}
+
+Both scores, of the cells all of whose runs logged what it takes. The other tables of this page have J(T)."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
