@@ -110,7 +110,7 @@ def test_the_last_minibatch_is_that_of_the_last_update():
 
 @pytest.mark.parametrize("target", ["value", "both"])
 def test_the_last_minibatch_is_for_the_policy_alone(target):
-    with pytest.raises(ValueError, match='`churn_base_loss` must be "actor" or "surrogate" unless .*, got \'last\''):
+    with pytest.raises(ValueError, match=r"`churn_base_loss` must be .* unless `churn_target` is .*, got 'last'"):
         CChainPPO("MlpPolicy", "CartPole-v1", churn_base_loss="last", churn_target=target)
 
 

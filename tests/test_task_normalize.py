@@ -92,7 +92,7 @@ class Cut(Noise):
 
 @pytest.mark.parametrize("returns_over_cuts", [False, True])
 def test_the_discounted_return_over_cuts(returns_over_cuts):
-    """Gymnasium's NormalizeReward lets it go on there. It starts over where an episode ends, and at the switch after step 20."""
+    """It may go on there, as Gymnasium's. It starts over where an episode ends, and at the switch after step 20."""
     env = DummyVecEnv([lambda: ContinualEnv([Cut, Cut], 20)])
     env = TaskVecNormalize(env, gamma=0.5, returns_over_cuts=returns_over_cuts)
     env.reset()

@@ -86,7 +86,8 @@ class Run:
             "seed": self.seed,
             "n_tasks": self.n_tasks,
             "steps_per_task": self.steps_per_task,
-            "eval_freq": self.eval_freq,
+            # Evaluations do not change the training, so they matter only where the returns are theirs
+            "eval_freq": self.eval_freq if SUITES[self.suite].evaluates else -1,
             "overrides": list(self.overrides),
             "hyperparameters": hyperparameters,
         }

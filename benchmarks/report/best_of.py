@@ -1,4 +1,4 @@
-"""Best of several strengths of a method: in each environment the best that was run, as the paper reports it, beside the shipped."""
+"""Best of several strengths: in each environment the best that was run, as the paper reports it, beside the shipped one."""
 
 import csv
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ COLUMNS = ("suite", "env_id", "method", "strength", "values", "seeds", "best", "
 WORDS = """\
 In each environment the best of the strengths of a method that were run (β of C-CHAIN, κ of weight clipping, c of L2 Init), by
 the mean over the seeds that all of them have, beside the shipped one. *Best of n* was chosen by the very runs that it is the
-mean of: it is **biased upwards**. Of equally good ones, the best mean is above the true one by 0.56 standard errors for n = 2,
-0.85 for n = 3, 1.03 for n = 4 and 1.16 for n = 5. The *shipped* strength was fixed beforehand. The paper's numbers are the best
-of three β, four κ and five c, so the best of the same ones is what compares with them: with fewer there is no verdict. The
-outcome is kept in `best_of.csv`."""
+mean of: it is **biased upwards**. Of equally good ones, the best mean is above the true one by 0.56 standard errors for
+n = 2, 0.85 for n = 3, 1.03 for n = 4 and 1.16 for n = 5. The *shipped* strength was fixed beforehand. The paper's numbers are
+the best of three β, four κ and five c, so the best of the same ones is what compares with them: with fewer there is no
+verdict. The outcome is kept in `best_of.csv`."""
 
 
 @dataclass(frozen=True)

@@ -182,8 +182,8 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
         notes.append("\n".join(different))
     if any("@" in line for _, line in cells):
         notes.append(
-            "Columns with β =, κ = or c = have the shipped hyperparameters but for that strength of the method. The paper has no "
-            "cells of them: it prints the best of several under the method's name."
+            "Columns with β =, κ = or c = have the shipped hyperparameters but for that strength of the method. The paper has "
+            "no cells of them: it prints the best of several under the method's name."
         )
     most = max((cell.seeds for cell in cells.values()), key=len, default=[])
     fewer: dict[str, list[str]] = {}

@@ -28,8 +28,9 @@ def last_surrogate(model: PPO) -> Iterator[Callable[[], float]]:
 
     def watched_get(batch_size: int | None = None) -> Iterator[Any]:
         nonlocal minibatch
-        for minibatch in get(batch_size):
-            yield minibatch
+        for sample in get(batch_size):
+            minibatch = sample
+            yield sample
 
     def watched_evaluate_actions(*args: Any, **kwargs: Any) -> Any:
         nonlocal log_prob

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_cchain.algorithms.churn_targets import churn_kind
+from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.last_surrogate import last_surrogate
 from sb3_cchain.algorithms.reference_batches import (
     REFERENCES,
@@ -163,14 +163,25 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         if isinstance(references, PreviousRollout):
             reducer.next_reference = references.current
         if reducer.losses:
-            if surrogate is None:
-                loss = abs(targets[name].base_loss(model, without_entropy=options.churn_base_loss == "surrogate"))
-            else:
-                loss, reducer.losses = abs(surrogate()), reducer.losses[-1:]
+            loss = _take_losses(model, targets[name], reducer, options, surrogate)
             _log(model.logger, name, "churn" if len(reducers) == 1 else f"churn/{name}", reducer, coefs[name], loss)
             reducer.end_iteration(loss)
     if value_churns:
         model.logger.record("churn/value_churn", np.mean(value_churns))
+
+
+def _take_losses(
+    model: Any,
+    target: ChurnTarget,
+    reducer: ChurnReducer,
+    options: PolicyChurnOptions,
+    surrogate: Callable[[], float] | None,
+) -> float:
+    """|L|. Of the churn losses, those of the updates that count are left."""
+    if surrogate is None:
+        return abs(target.base_loss(model, without_entropy=options.churn_base_loss == "surrogate"))
+    reducer.losses = reducer.losses[-1:]
+    return abs(surrogate())
 
 
 def _log(logger: Logger, name: str, prefix: str, reducer: ChurnReducer, coef: float, loss: float) -> None:

@@ -29,8 +29,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
 
     - the reference batch shares no sample with the minibatch whose update is measured, as the paper demands; the released
       code draws both independently;
-    - λ is adapted to the mean losses over an iteration's updates; in DeepMind Control the released code takes those of the last
-      minibatch, as ``churn_base_loss="last"`` does: the surrogate there is greater in absolute value;
+    - λ is adapted to the mean losses over an iteration's updates; in DeepMind Control the released code takes those of the
+      last minibatch, as ``churn_base_loss="last"`` does: the surrogate there is greater in absolute value;
     - the old outputs are computed before the update instead of by a copy of the network after it, with the same result.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
