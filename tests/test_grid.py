@@ -352,6 +352,9 @@ def test_evaluations_are_the_papers(suite, env_id, steps, interval, deterministi
     assert option == "--hyperparams" and evaluation == {"sb3_cchain.analysis.EvalTrainedTask": arguments}
     # Before the Oracle's fresh networks; all others as shipped
     assert [sync, *others] == run.settings["hyperparameters"]["callback"] and "Oracle" in str(others)
+    # Beside callbacks of the run's own
+    own = replace(run, overrides=("callback:['sb3_cchain.TaskSync', 'mine']", "n_epochs:1")).hyperparams
+    assert own == ["n_epochs:1", f"callback:{['sb3_cchain.TaskSync', evaluation, 'mine']}"]
     assert run.eval_freq == interval and run.arguments(Path("logs"))[13:15] == ["--eval-freq", "-1"]
 
 

@@ -874,7 +874,9 @@ def test_the_verdict_goes_by_the_rule_of_the_released_code_where_it_was_logged(t
     assert cells[ACROBOT, "trac"].released_scores is None
     assert verdict_words(cells[ACROBOT, "cchain"], paper.figures[ACROBOT, "cchain"], LENGTH) == "✓ agrees"
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
-    rows = table_rows((tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1])
+    text = (tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1]
+    assert "\n\nWithout it: Acrobot-v1, TRAC.\n\n" in text
+    rows = [row for row in table_rows(text) if len(row) == 6]
     both = ["0 1 2", "-95.0 ± 2.9", "-115.0 ± 2.9", "-119.2 ± 6.9", "✓ agrees"]
     assert [row for row in rows if "Acrobot-v1, " in row[0]] == [["Acrobot-v1, C-CHAIN PPO", *both]]
 

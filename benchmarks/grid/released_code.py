@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,3 +53,11 @@ class Evaluation:
         :return: Environment steps between two evaluations
         """
         return min(max(steps_per_task // self.per_task, self.least_interval), steps_per_task)
+
+    def callback(self, interval: int) -> dict[str, dict[str, Any]]:
+        """
+        :param interval: Environment steps between two evaluations
+        :return: The callback that evaluates, as in a YAML file
+        """
+        arguments = {"interval": interval, "n_eval_episodes": self.n_episodes, "deterministic": self.deterministic}
+        return {"sb3_cchain.analysis.EvalTrainedTask": arguments}

@@ -1,5 +1,6 @@
 """What a training run is: the command that a user would type, and the settings by which a finished run counts as this one."""
 
+import ast
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -93,19 +94,23 @@ class Run:
         }
 
     @property
-    def recording(self) -> tuple[str, ...]:
-        """What makes training log what the run is scored by, as after ``--hyperparams``. It does not change the training."""
-        suite = SUITES[self.suite]
-        if suite.evaluation is None or self.eval_freq < 0:
-            return suite.recording
-        evaluation = {
-            "interval": self.eval_freq,
-            "n_eval_episodes": suite.evaluation.n_episodes,
-            "deterministic": suite.evaluation.deterministic,
-        }
-        # After TaskSync, and before what changes the networks at a switch
-        sync, *others = (shipped_hyperparameters(self.algo, self.env_id) or {})["callback"]
-        return (f"callback:{[sync, {'sb3_cchain.analysis.EvalTrainedTask': evaluation}, *others]}", *suite.recording)
+    def hyperparams(self) -> list[str]:
+        """
+        What stands after ``--hyperparams``: the overrides, and what makes training log the scores. The latter does not change
+        the training, so it is not part of the settings.
+        """
+        suite, overrides = SUITES[self.suite], list(self.overrides)
+        if suite.evaluation is not None and self.eval_freq > 0:
+            given = next((text for text in overrides if text.startswith("callback:")), None)
+            if given is None:
+                callbacks = (shipped_hyperparameters(self.algo, self.env_id) or {})["callback"]
+            else:
+                callbacks = ast.literal_eval(given.removeprefix("callback:"))
+                overrides.remove(given)
+            # After TaskSync, and before what changes the networks at a switch
+            sync, *others = callbacks
+            overrides.append(f"callback:{[sync, suite.evaluation.callback(self.eval_freq), *others]}")
+        return [*overrides, *suite.recording]
 
     def path_in(self, folder: Path) -> Path:
         """
@@ -128,7 +133,7 @@ class Run:
             *("--eval-freq", "-1", "--eval-episodes", "10"),
             *("--log-folder", str(folder), "--tensorboard-log", str(folder / "tensorboard"), "--verbose", "0"),
             *("--env-kwargs", *(f"{name}:{value}" for name, value in env_kwargs.items())),
-            *(("--hyperparams", *hyperparams) if (hyperparams := (*self.overrides, *self.recording)) else ()),
+            *(("--hyperparams", *self.hyperparams) if self.hyperparams else ()),
         ]
 
 

@@ -203,23 +203,28 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
 def _released_section(suite: str, cells: Cells, paper: Table) -> list[str]:
     """J(T) by both rules, of the cells whose runs logged that of the released code."""
     digits = table_digits(paper)
-    rows = []
+    rows, without = [], []
     for env_id, length in paper.lengths.items():
         for method in table_methods(cells, paper):
             cell, figure = cells.get((env_id, method)), paper.figures.get((env_id, method))
-            if cell is None or cell.released_scores is None:
+            if cell is None:
+                continue
+            name = f"{short_name(env_id)}, {method_label(suite, method)}"
+            if cell.released_scores is None:
+                without.append(name)
                 continue
             both = [_score(*mean_and_error(scores), digits) for scores in (cell.scores, cell.released_scores)]
             printed = [MISSING, MISSING]
             if figure is not None:
                 printed = [_score(figure.mean, figure.standard_error, digits), verdict_words(cell, figure, length)]
-            rows.append([f"{short_name(env_id)}, {method_label(suite, method)}", seeds_text(cell.seeds), *both, *printed])
+            rows.append([name, seeds_text(cell.seeds), *both, *printed])
     score = SUITES[suite].score
     if score is None or not rows:
         return []
     header = ["", "seeds", "J(T)", "by the released code", "paper", "verdict, by the released code"]
     words = RELEASED_WORDS.format(rule=score.words)
-    return ["### By the rule of the released code", words, markdown_table(header, rows)]
+    parts = ["### By the rule of the released code", words, markdown_table(header, rows)]
+    return [*parts, f"Without it: {'; '.join(without)}."] if without else parts
 
 
 def _score(mean: float, error: float | None, digits: int) -> str:
