@@ -269,6 +269,17 @@ def test_the_strength_of_an_optimizer_is_in_its_arguments(env_id, line, shipped,
     assert find_result(run, tmp_path).line == run.line and strength_of(find_result(run, tmp_path)) == strength
 
 
+def test_the_shipped_strengths():
+    shipped = {
+        (suite, method): {strength_of(Run(suite, env_id, method, 0, 2, 800, "smoke")) for env_id in SUITES[suite].env_ids}
+        for suite in ("gym_control", "procgen")
+        for method in ("weight_clipping", "l2_init", "cchain")
+    }
+    assert set(map(tuple, shipped.values())) == {("1",), ("10",), ("1e4",)}
+    walker, dog = (Run("dmc", f"Continual/{name}-v0", "cchain", 0, 2, 800, "smoke") for name in ("Walker", "Dog"))
+    assert (strength_of(walker), strength_of(dog)) == ("0.5", "0.05")
+
+
 @pytest.mark.parametrize("number, text", [(1e3, "1e3"), (100, "100"), (0.05, "0.05"), (12345, "12345"), (1 / 3, repr(1 / 3))])
 def test_each_strength_has_one_name(number, text):
     assert split_line(f"cchain@{number!r}") == ("cchain", text) and float(text) == number
