@@ -31,11 +31,11 @@ from benchmarks.grid.run import (
     make_run,
     other_strength,
     paper_methods,
-    split_line,
     strength_of,
     suite_methods,
 )
 from benchmarks.grid.score_table import score_table
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES, task_names
 from benchmarks.grid.training import evaluation_metrics, metrics_rows
 from benchmarks.grid.view import Failure, Progress, View, duration

@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, split_line, suite_methods
+from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, suite_methods
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
 

@@ -2,13 +2,13 @@
 
 import ast
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from benchmarks.grid.strengths import read_strength, split_line, strength_override, with_strength
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, Method, Strength
 from sb3_cchain.zoo.settings import read_settings
@@ -172,7 +172,8 @@ def make_run(
         raise ValueError(f"`n_tasks` must be at most {paper_length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
     run = Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
     if strength is not None:
-        run = replace(run, variant=f"{method}@{strength}", overrides=(_strength_override(run, strength),))
+        differing = with_strength(_strength(run), run.settings["hyperparameters"], strength)
+        run = replace(run, variant=f"{method}@{strength}", overrides=(strength_override(differing, strength),))
     evaluation = SUITES[suite].evaluation
     if evaluation is None:
         return run
@@ -180,39 +181,6 @@ def make_run(
     if not 0 < interval <= steps_per_task:
         raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
     return replace(run, eval_freq=interval)
-
-
-def split_line(line: str) -> tuple[str, str | None]:
-    """
-    :param line: Name of a method, with another strength as in ``cchain@1e3``
-    :return: Name of the method; and the strength in its shortest form, so that ``cchain@1000`` is the same run, or None
-    :raises ValueError: When the strength is not a number greater than 0, or the method has none
-    """
-    method, at, text = line.partition("@")
-    if not at:
-        return line, None
-    strengths = {row.name: row.strength for row in REGISTRY if row.strength is not None}
-    if method not in strengths:
-        allowed = ", ".join(f"{name} ({strength.symbol})" for name, strength in strengths.items())
-        raise ValueError(f"`method` can have a strength after @ for {allowed} only; got {line}")
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        symbol = strengths[method].symbol
-        raise ValueError(f"`method` must have {symbol} after @, a number greater than 0, as in {method}@10; got {line}")
-    return method, shortest(value)
-
-
-def shortest(number: float) -> str:
-    """
-    :param number: A number
-    :return: Its shortest form
-    """
-    mantissa, exponent = f"{number:e}".split("e")
-    texts = (f"{number:g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}", repr(number))
-    return min((text for text in texts if float(text) == number), key=len)
 
 
 def other_strength(run: Run) -> dict[str, Any]:
@@ -225,47 +193,25 @@ def other_strength(run: Run) -> dict[str, Any]:
         method, strength = split_line(run.variant or "")
     except ValueError:
         return {}
-    if strength is None or method != run.method or run.overrides != (_strength_override(run, strength),):
+    if strength is None or method != run.method:
         return {}
-    return _with_strength(run, strength)
+    differing = with_strength(_strength(run), run.settings["hyperparameters"], strength)
+    return differing if run.overrides == (strength_override(differing, strength),) else {}
 
 
 def strength_of(run: Run) -> str:
     """
     :param run: A run of a method that has a strength
     :return: The strength in its shortest form
+    :raises ValueError: When it is not among the hyperparameters
     """
-    hyperparameters = {**run.settings["hyperparameters"], **other_strength(run)}
-    argument = _strength(run).argument
-    if argument in hyperparameters:
-        return shortest(float(hyperparameters[argument]))
-    found = re.search(_in_policy_kwargs(argument), hyperparameters["policy_kwargs"])
-    assert found is not None
-    return shortest(float(found[0].split("=")[1]))
+    return read_strength(_strength(run), {**run.settings["hyperparameters"], **other_strength(run)})
 
 
 def _strength(run: Run) -> Strength:
     strength = suite_methods(run.suite)[run.method].strength
     assert strength is not None
     return strength
-
-
-def _with_strength(run: Run, strength: str) -> dict[str, Any]:
-    """The hyperparameter that holds the strength, or whose text does, with another strength."""
-    argument, shipped = _strength(run).argument, run.settings["hyperparameters"]
-    if argument in shipped:
-        return {argument: float(strength)}
-    return {"policy_kwargs": re.sub(_in_policy_kwargs(argument), f"{argument}={strength}", shipped["policy_kwargs"])}
-
-
-def _strength_override(run: Run, strength: str) -> str:
-    """What is given after ``--hyperparams`` for another strength."""
-    ((name, value),) = _with_strength(run, strength).items()
-    return f"{name}:{value!r}" if name == "policy_kwargs" else f"{name}:{strength}"
-
-
-def _in_policy_kwargs(argument: str) -> str:
-    return rf"\b{argument}=[^,)]+"
 
 
 def lines_in_order(lines: Iterable[str]) -> list[str]:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.grid.run import lines_in_order, short_name, shortest, split_line, strength_of, suite_methods
+from benchmarks.grid.run import lines_in_order, short_name, strength_of, suite_methods
+from benchmarks.grid.strengths import shortest, split_line
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import Table

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, budget_length
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, lines_in_order, short_name, split_line, strength_of
+from benchmarks.grid.run import Run, lines_in_order, short_name, strength_of
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.best_of import paper_strengths
 from benchmarks.report.cells import Cells, versions_text

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import lines_in_order, short_name, split_line, suite_lines
+from benchmarks.grid.run import lines_in_order, short_name, suite_lines
+from benchmarks.grid.strengths import split_line
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.estimates import best_two
 from benchmarks.report.markdown import markdown_table
