@@ -614,7 +614,9 @@ def test_a_run_and_its_result(trained):
     assert result.settings == RUN.settings
     assert [(row["timesteps"], row["task_id"]) for row in result.returns] == [(800, 0), (1600, 1)]
     metrics = result.metrics
-    assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith(METRIC_PREFIXES) for name in metrics)
+    score = SUITES["gym_control"].score.metric
+    assert set(metrics) >= {"churn/coef", "churn/policy_churn", score}
+    assert all(name.startswith(METRIC_PREFIXES) or name == score for name in metrics)
     # SB3 writes what an update logged with the rollout after it
     assert [steps for steps, _ in metrics["churn/coef"]] == [1600]
     assert result.command[:4] == ["sb3-cchain", "train", "--algo", "ppo_cchain"]
