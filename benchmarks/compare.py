@@ -30,7 +30,9 @@ def main() -> None:
     parser.add_argument("--n-tasks", type=int, help="Length of the task sequence, by default the paper's")
     parser.add_argument("--steps-per-task", type=int, help="Environment steps per task, by default the paper's")
     parser.add_argument(
-        "--eval-freq", type=int, help="MinAtar: environment steps between evaluations, by default 30 in a task"
+        "--eval-freq",
+        type=int,
+        help="MinAtar, DeepMind Control: environment steps between evaluations, by default the paper's",
     )
     parser.add_argument("--random-episodes", type=int, default=50, help="Episodes of the random policy in each task")
     parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")

@@ -32,7 +32,7 @@ from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.algorithms.churn_targets import churn_kind
-from sb3_cchain.analysis import Doctor, EvalAllTasks, NetworkHealth, NTKCallback
+from sb3_cchain.analysis import Doctor, EvalAllTasks, EvalTrainedTask, NetworkHealth, NTKCallback
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint import ResumableEnv, TrainingCheckpoint, find_checkpoint, resume
 from sb3_cchain.checkpoint.training_description import constructor_arguments
@@ -146,8 +146,8 @@ class Case:
         continual = [TaskSync(), ContinualMetrics(folder / "returns.csv")] if self.continual else []
         own = self.callbacks()
         for callback in own:
-            if isinstance(callback, EvalAllTasks):
-                callback.path = folder / "task_returns.csv"
+            if isinstance(callback, (EvalAllTasks, EvalTrainedTask)):
+                callback.path = folder / callback.file_name
         others = [*continual, *own, stop or Stop(float("inf"))]
         checkpoint = TrainingCheckpoint(save_freq, folder / "checkpoints")
         return [*others, checkpoint] if self.checkpoint_last else [checkpoint, *others]
@@ -235,6 +235,7 @@ CASES = {
         *(CChainPPO, vec_env("Continual/Acrobot-v1", **ACROBOT), {**ON_POLICY, **CHURN, "churn_reference": "next"}),
         callbacks=lambda: [
             *(ChurnMonitor(interval=1), EvalAllTasks(n_eval_episodes=1, interval=60)),
+            EvalTrainedTask(n_eval_episodes=1, interval=30, deterministic=False),
             *continual_evaluation("Continual/Acrobot-v1", **ACROBOT),
         ],
         checkpoint_last=True,
@@ -471,6 +472,7 @@ ATTRIBUTES = (
     *("num_timesteps", "_n_updates", "_episode_num", "_last_obs", "_last_episode_starts", "_last_original_obs"),
     *("exploration_rate", "_total_timesteps", "_current_progress_remaining", "_n_calls", "continual_returns"),
     "task_returns",
+    "evaluations",
     *("learning_starts", "_last_lstm_states", "churn_state", "continual_state"),
 )
 

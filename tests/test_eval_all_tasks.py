@@ -208,7 +208,7 @@ def test_tasks_are_the_environments_own_whatever_a_signal_says():
 
 def test_charts():
     tags = {f"continual_eval/{name}" for name in ("task_0", "average", "forgetting", "zero_shot_transfer")}
-    assert len(layout_of(tags)["Evaluations on all tasks"]) == 4
+    assert len(layout_of(tags)["Evaluations on the tasks"]) == 4
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_bad_arguments(kwargs, error, message):
 @pytest.mark.parametrize(
     "env, eval_env, error, message",
     [
-        (tasks, lambda: None, ValueError, "was not made by gymnasium.make.* give EvalAllTasks an `eval_env`"),
+        (tasks, lambda: None, ValueError, "was not made by gymnasium.make.* give the callback an `eval_env`"),
         (
             tasks,
             lambda: gym.make("Continual/CartPole-v1"),

@@ -1,5 +1,6 @@
 """The grid: its runs, their results, and that neither is lost or made twice when something dies."""
 
+import ast
 import json
 import os
 import re
@@ -23,10 +24,20 @@ from benchmarks.grid.executor import RETRIES, LocalBackend, complete, gpu_places
 from benchmarks.grid.plan import Rates, grid_runs, run_length
 from benchmarks.grid.ray_backend import RayBackend, count_slots
 from benchmarks.grid.results import METRIC_PREFIXES, RENAMED, Result, find_result, read_result, read_results, write_result
-from benchmarks.grid.run import ROOT, Run, as_json, make_run, other_beta, paper_methods, split_line, suite_methods
+from benchmarks.grid.run import (
+    ROOT,
+    Run,
+    as_json,
+    make_run,
+    other_strength,
+    paper_methods,
+    strength_of,
+    suite_methods,
+)
 from benchmarks.grid.score_table import score_table
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES, task_names
-from benchmarks.grid.training import metrics_rows
+from benchmarks.grid.training import evaluation_metrics, metrics_rows
 from benchmarks.grid.view import Failure, Progress, View, duration
 from benchmarks.run import main
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
@@ -123,10 +134,11 @@ def test_writers_at_once_leave_one_whole_result(tmp_path, same):
 def test_a_result_counts_under_its_settings_alone(tmp_path):
     result = make_result(tmp_path)
     write_result(result, ROWS, [])
-    assert find_result(RUN, tmp_path) == result
+    # Evaluations besides do not change the training
+    assert find_result(RUN, tmp_path) == result == find_result(replace(RUN, eval_freq=5), tmp_path)
     for change in (
         *(dict(seed=1), dict(method="vanilla"), dict(experiment="paper"), dict(n_tasks=3), dict(steps_per_task=801)),
-        *(dict(eval_freq=5), dict(overrides=("n_epochs:1",)), dict(variant="orthogonal")),
+        *(dict(overrides=("n_epochs:1",)), dict(variant="orthogonal")),
     ):
         assert find_result(replace(RUN, **change), tmp_path) is None
     hyperparameters = {**RUN.settings["hyperparameters"], "learning_rate": 1.0}
@@ -167,6 +179,15 @@ def test_the_committed_results_count(capsys):
     assert "24 runs, 24 of them done." in capsys.readouterr().out
 
 
+def test_an_evaluation_after_the_last_rollout_of_a_task_is_of_that_task():
+    evaluations = [
+        {"timesteps": steps, "task_id": task, "n_episodes": 10, "mean_return": value}
+        for steps, task, value in ((0, 0, 1.0), (1024, 0, 2.0), (1536, 0, 4.0), (2048, 1, 1 / 3))
+    ]
+    rows = evaluation_metrics(evaluations, replace(RUN, steps_per_task=1100))
+    assert [(row["timesteps"], row["value"]) for row in rows] == [(0, "1"), (1024, "2"), (1100, "4"), (2048, "0.333333")]
+
+
 # --- The grid -----------------------------------------------------------------------------------------------------------
 
 
@@ -205,7 +226,7 @@ def test_the_grid_of_gym_control():
     assert len(grid_runs(["gym_control"], ["Continual/CartPole-v1"], ["vanilla"])) == 6
 
 
-def test_another_beta_is_a_line_of_its_own(tmp_path):
+def test_another_strength_is_a_line_of_its_own(tmp_path):
     cartpole = ["Continual/CartPole-v1"]
     grid = grid_runs(["gym_control"], cartpole, ["cchain@1000", "vanilla", "cchain@0.05", "cchain@1e3", "cchain"], 2)
     assert [(run.seed, run.line, run.method) for run in grid] == [
@@ -215,7 +236,8 @@ def test_another_beta_is_a_line_of_its_own(tmp_path):
     ]
     run, plain = grid[0], grid[3]
     assert run.overrides == ("target_churn_ratio:1e3",) and run.arguments(Path("logs"))[-1] == run.overrides[0]
-    assert (other_beta(run), other_beta(plain)) == ({"target_churn_ratio": 1000.0}, {})
+    assert (other_strength(run), other_strength(plain)) == ({"target_churn_ratio": 1000.0}, {})
+    assert (strength_of(run), strength_of(plain)) == ("1e3", "1e4")
     assert run.path_in(tmp_path).parts[-2:] == ("cchain@1e3", "seed_0") and run.name == "CartPole-v1 cchain@1e3 seed 0"
     # It takes as long as the shipped one
     result = make_result(tmp_path, replace(plain, n_tasks=1, steps_per_task=100), seconds=50.0)
@@ -226,8 +248,40 @@ def test_another_beta_is_a_line_of_its_own(tmp_path):
     assert (evaluated.eval_freq, evaluated.line, evaluated.algo) == (100, "cchain@0.1", "dqn_cchain")
 
 
+@pytest.mark.parametrize("env_id", ["Continual/CartPole-v1", "Continual/Starpilot-v0"])
+@pytest.mark.parametrize(
+    "line, shipped, argument", [("weight_clipping@.5", "1", "clip_ratio"), ("l2_init@1000", "10", "coef")]
+)
+def test_the_strength_of_an_optimizer_is_in_its_arguments(env_id, line, shipped, argument, tmp_path):
+    suite = "gym_control" if env_id == "Continual/CartPole-v1" else "procgen"
+    run = make_run(suite, env_id, line, 0, 2, 800, "smoke")
+    plain = make_run(suite, env_id, run.method, 0, 2, 800, "smoke")
+    strength = split_line(run.line)[1]
+    assert (strength_of(plain), strength_of(run)) == (shipped, strength) and other_strength(plain) == {}
+    # All else is as shipped
+    text, shipped_text = other_strength(run)["policy_kwargs"], plain.settings["hyperparameters"]["policy_kwargs"]
+    old = next(part for part in (f"{argument}={shipped}.0", f"{argument}={shipped}") if part in shipped_text)
+    assert text == shipped_text.replace(old, f"{argument}={strength}") != shipped_text
+    # RL Zoo evaluates what is given after --hyperparams, and takes a text for `policy_kwargs`, as in the YAML file
+    name, _, value = run.overrides[0].partition(":")
+    assert name == "policy_kwargs" and ast.literal_eval(value) == text
+    write_result(make_result(tmp_path, run, hyperparameters=run.settings["hyperparameters"]), ROWS, [])
+    assert find_result(run, tmp_path).line == run.line and strength_of(find_result(run, tmp_path)) == strength
+
+
+def test_the_shipped_strengths():
+    shipped = {
+        (suite, method): {strength_of(Run(suite, env_id, method, 0, 2, 800, "smoke")) for env_id in SUITES[suite].env_ids}
+        for suite in ("gym_control", "procgen")
+        for method in ("weight_clipping", "l2_init", "cchain")
+    }
+    assert set(map(tuple, shipped.values())) == {("1",), ("10",), ("1e4",)}
+    walker, dog = (Run("dmc", f"Continual/{name}-v0", "cchain", 0, 2, 800, "smoke") for name in ("Walker", "Dog"))
+    assert (strength_of(walker), strength_of(dog)) == ("0.5", "0.05")
+
+
 @pytest.mark.parametrize("number, text", [(1e3, "1e3"), (100, "100"), (0.05, "0.05"), (12345, "12345"), (1 / 3, repr(1 / 3))])
-def test_each_beta_has_one_name(number, text):
+def test_each_strength_has_one_name(number, text):
     assert split_line(f"cchain@{number!r}") == ("cchain", text) and float(text) == number
 
 
@@ -285,8 +339,34 @@ def test_a_run_is_the_command_that_a_user_would_type():
         "--device",
         "cuda",
     ]
-    evaluated = make_run("minatar", "Continual/MinAtar-v0", "vanilla", 3, 3, 150_000, "reduced")
-    assert evaluated.eval_freq == 5000 and evaluated.algo == "double_dqn"
+    recorded = make_run("procgen", "Continual/Maze-v0", "vanilla", 0, 5, 200_000, "reduced")
+    assert recorded.arguments(Path("logs"))[-2:] == ["--hyperparams", "stats_window_size:5"]
+    assert "stats_window_size" not in str(recorded.settings)
+
+
+@pytest.mark.parametrize(
+    "suite, env_id, steps, interval, deterministic",
+    [
+        ("minatar", "Continual/MinAtar-v0", 1_500_000, 50_000, True),
+        ("minatar", "Continual/MinAtar-v0", 150_000, 5000, True),
+        ("dmc", "Continual/Walker-v0", 1_000_000, 20_000, False),
+        # Evaluations of 10 000 steps are not affordable more often
+        ("dmc", "Continual/Walker-v0", 100_000, 20_000, False),
+        ("dmc", "Continual/Walker-v0", 4096, 4096, False),
+    ],
+)
+def test_evaluations_are_the_papers(suite, env_id, steps, interval, deterministic):
+    run = make_run(suite, env_id, "oracle", 0, 2, steps, "paper")
+    *_, option, callbacks = run.arguments(Path("logs"))
+    sync, evaluation, *others = ast.literal_eval(callbacks.removeprefix("callback:"))
+    arguments = {"interval": interval, "n_eval_episodes": 10, "deterministic": deterministic}
+    assert option == "--hyperparams" and evaluation == {"sb3_cchain.analysis.EvalTrainedTask": arguments}
+    # Before the Oracle's fresh networks; all others as shipped
+    assert [sync, *others] == run.settings["hyperparameters"]["callback"] and "Oracle" in str(others)
+    # Beside callbacks of the run's own
+    own = replace(run, overrides=("callback:['sb3_cchain.TaskSync', 'mine']", "n_epochs:1")).hyperparams
+    assert own == ["n_epochs:1", f"callback:{['sb3_cchain.TaskSync', evaluation, 'mine']}"]
+    assert run.eval_freq == interval and run.arguments(Path("logs"))[13:15] == ["--eval-freq", "-1"]
 
 
 @pytest.mark.parametrize(
@@ -321,9 +401,13 @@ def test_runs_that_cannot_be_are_refused(changes, message):
             "--env must be one of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0",
         ),
         (["--method", "reset"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got reset"),
-        (["--method", "cchain@x"], "`method` must have β after @, a number greater than 0, as in cchain@1e3; got cchain@x"),
+        (["--method", "cchain@x"], "`method` must have β after @, a number greater than 0, as in cchain@10; got cchain@x"),
         (["--method", "cchain@-1"], "a number greater than 0, .*; got cchain@-1"),
-        (["--method", "trac@1e3"], "`method` can have a β after @ for cchain only; got trac@1e3"),
+        (["--method", "l2_init@0"], "`method` must have c after @, a number greater than 0, as in l2_init@10; got l2_init@0"),
+        (
+            ["--method", "trac@1"],
+            r"a strength after @ for weight_clipping \(κ\), l2_init \(c\), cchain \(β\) only; got trac@1",
+        ),
         (["--seeds", "0"], "--seeds must be at least 1; got 0"),
         (["--gpus-per-run", "-1"], "--gpus-per-run must be from 0.0001 to 1, or a whole number; got -1"),
         (["--gpus-per-run", "1.5"], "--gpus-per-run must be .*; got 1.5"),
@@ -530,7 +614,9 @@ def test_a_run_and_its_result(trained):
     assert result.settings == RUN.settings
     assert [(row["timesteps"], row["task_id"]) for row in result.returns] == [(800, 0), (1600, 1)]
     metrics = result.metrics
-    assert set(metrics) >= {"churn/coef", "churn/policy_churn"} and all(name.startswith(METRIC_PREFIXES) for name in metrics)
+    score = SUITES["gym_control"].score.metric
+    assert set(metrics) >= {"churn/coef", "churn/policy_churn", score}
+    assert all(name.startswith(METRIC_PREFIXES) or name == score for name in metrics)
     # SB3 writes what an update logged with the rollout after it
     assert [steps for steps, _ in metrics["churn/coef"]] == [1600]
     assert result.command[:4] == ["sb3-cchain", "train", "--algo", "ppo_cchain"]
@@ -560,7 +646,7 @@ def test_runs_of_the_other_suites(suite, env_id, method, names, overrides, tmp_p
     assert result.task_names == names
     rows = result.returns
     if suite == "minatar":
-        assert [tuple(row.values())[:3] for row in rows] == [(200, 0, 10), (400, 1, 10)]
+        assert [tuple(row.values())[:3] for row in rows] == [(0, 0, 10), (200, 0, 10), (400, 1, 10)]
     assert {row["task_id"] for row in rows} <= {0, 1} and rows
 
 

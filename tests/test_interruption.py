@@ -41,7 +41,7 @@ PUBLIC = {
 
 def make_callback(name):
     arguments = ARGUMENTS.get(name, {})
-    if name == "EvalAllTasks":
+    if name in ("EvalAllTasks", "EvalTrainedTask"):
         arguments = dict(eval_env=make_env(), n_eval_episodes=1)
     return PUBLIC[name](**arguments)
 

@@ -81,6 +81,39 @@ def test_adaptive_coefficient_holds_the_ratio(churn_base_loss, of_entropy):
     assert coefficient.value == pytest.approx(1e4 * base_loss / logged["churn/loss"], rel=1e-4)
 
 
+@pytest.mark.parametrize("component", ["full", "projection"])  # one pass for both losses, and passes of their own
+@pytest.mark.parametrize("normalize_advantage", [True, False])
+def test_the_losses_of_the_last_minibatch_set_the_coefficient(component, normalize_advantage):
+    # SB3 logs the loss of the last minibatch: without entropy and values it is the clipped surrogate
+    arguments = dict(churn_warmup=1, churn_window=1, churn_base_loss="last", churn_component=component)
+    losses = dict(ent_coef=0.0, vf_coef=0.0, normalize_advantage=normalize_advantage, learning_rate=1e-2)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", **arguments, **losses, **{**SETTINGS, "n_epochs": 3})
+    churn_losses = []
+    record = model.churn_reducer.record
+    model.churn_reducer.record = lambda loss: (churn_losses.append(loss.item()), record(loss))[1]
+    model.learn(4 * 32)
+    logged, coefficient = model.logger.name_to_value, model.churn_reducer.coefficient
+    assert coefficient.base_losses.item() == pytest.approx(abs(logged["train/loss"]), rel=1e-5)
+    assert logged["train/loss"] != pytest.approx(logged["train/policy_gradient_loss"], rel=1e-3)  # the mean
+    assert coefficient.churn_losses.item() == pytest.approx(churn_losses[-1]) == pytest.approx(logged["churn/loss"])
+    assert "evaluate_actions" not in vars(model.policy) and "get" not in vars(model.rollout_buffer)
+
+
+def test_the_last_minibatch_is_that_of_the_last_update():
+    """``target_kl`` stops after a minibatch was evaluated: SB3 logs its loss, and no update is made with it."""
+    arguments = dict(churn_warmup=1, churn_window=1, churn_base_loss="last", target_kl=0.01, ent_coef=0.0, vf_coef=0.0)
+    model = CChainPPO("MlpPolicy", "CartPole-v1", **arguments, **{**SETTINGS, "learning_rate": 1e-2, "n_epochs": 3})
+    model.learn(32)
+    coefficient, logged = model.churn_reducer.coefficient, model.logger.name_to_value
+    assert coefficient.n_seen == 1 and coefficient.base_losses.item() != pytest.approx(abs(logged["train/loss"]), rel=1e-3)
+
+
+@pytest.mark.parametrize("target", ["value", "both"])
+def test_the_last_minibatch_is_for_the_policy_alone(target):
+    with pytest.raises(ValueError, match=r"`churn_base_loss` must be .* unless `churn_target` is .*, got 'last'"):
+        CChainPPO("MlpPolicy", "CartPole-v1", churn_base_loss="last", churn_target=target)
+
+
 def test_policy_churn_is_the_kl_divergence():
     """One update per iteration, so that the logged mean is one number that can be computed from two saved policies."""
     model = CChainPPO(

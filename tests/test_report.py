@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.grid.results import WITH_CUT, Result, read_results, write_result
-from benchmarks.grid.run import ROOT, Run, as_json, paper_methods, shipped_hyperparameters, suite_methods
+from benchmarks.grid.results import Result, read_results, write_result
+from benchmarks.grid.run import ROOT, Run, as_json, make_run, paper_methods, shipped_hyperparameters, suite_methods
 from benchmarks.grid.suites import SUITES, paper_length
 from benchmarks.report.__main__ import main
-from benchmarks.report.best_of import best_betas, best_table, write_best
+from benchmarks.report.best_of import COLUMNS, best_strengths, best_table, paper_strengths, write_best
 from benchmarks.report.cells import make_cells
 from benchmarks.report.continual_table import continual_table
 from benchmarks.report.document import write_report
@@ -836,7 +836,7 @@ def write_long(folder, method, value, seed=0, **fields):
 
 
 def with_cut(value):
-    return [(LENGTH[1] * (task + 1), WITH_CUT, value) for task in range(LENGTH[0])]
+    return [(LENGTH[1] * (task + 1), "continual/mean_return_with_cut", value) for task in range(LENGTH[0])]
 
 
 @pytest.mark.parametrize(
@@ -870,13 +870,53 @@ def test_the_verdict_goes_by_the_rule_of_the_released_code_where_it_was_logged(t
         write_long(tmp_path, "cchain", value, seed, metrics=with_cut(value - 20))
         write_long(tmp_path, "trac", value, seed, metrics=with_cut(value - 20) if seed else ())
     cells, paper = cells_in(tmp_path), read_tables()["gym_control"]
-    assert cells[ACROBOT, "cchain"].scores_with_cut == (-110.0, -115.0, -120.0)
-    assert cells[ACROBOT, "trac"].scores_with_cut is None
+    assert cells[ACROBOT, "cchain"].released_scores == (-110.0, -115.0, -120.0)
+    assert cells[ACROBOT, "trac"].released_scores is None
     assert verdict_words(cells[ACROBOT, "cchain"], paper.figures[ACROBOT, "cchain"], LENGTH) == "✓ agrees"
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
-    rows = table_rows((tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1])
+    text = (tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1]
+    assert "\n\nWithout it: Acrobot-v1, TRAC.\n\n" in text
+    rows = [row for row in table_rows(text) if len(row) == 6]
     both = ["0 1 2", "-95.0 ± 2.9", "-115.0 ± 2.9", "-119.2 ± 6.9", "✓ agrees"]
     assert [row for row in rows if "Acrobot-v1, " in row[0]] == [["Acrobot-v1, C-CHAIN PPO", *both]]
+
+
+@pytest.mark.parametrize(
+    ("suite", "env_id", "metrics", "expected"),
+    [
+        # ProcGen: every tenth iteration of 1000 steps alone, so 2 and 5 in the first task, 7 in the second
+        (
+            *("procgen", "Continual/Starpilot-v0"),
+            [(9000, 1.0), (10_000, 2.0), (11_000, 3.0), (20_000, 5.0), (30_000, 7.0), (39_000, 9.0)],
+            [3.5, 7.0],
+        ),
+        # DeepMind Control: all evaluations, from before training to right after the task
+        ("dmc", "Continual/Walker-v0", [(0, 10.0), (18_432, 20.0), (20_000, 60.0), (38_912, 5.0), (40_000, 7.0)], [30.0, 6.0]),
+        ("gym_control", ACROBOT, [(800, -400.0), (20_000, -100.0), (20_800, -50.0)], [-250.0, -50.0]),
+    ],
+)
+def test_scores_by_the_released_code_by_hand(tmp_path, no_drawing, suite, env_id, metrics, expected):
+    name = SUITES[suite].score.metric
+    logged = [(steps, name, value) for steps, value in metrics]
+    write(tmp_path, "cchain", [[1], [2]], env_id, suite=suite, steps_per_task=20_000, metrics=logged)
+    (result,) = whole_results(tmp_path)
+    assert result.released_averages() == expected
+    write_report([result], "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text().split("### By the rule of the released code")[1]
+    assert SUITES[suite].score.words in text
+    digits = 1 if suite != "procgen" else 2
+    score = f"{np.mean(expected):.{digits}f}"
+    row = next(row for row in table_rows(text) if row[0].startswith(f"{env_id.removeprefix('Continual/')}, "))
+    assert row[1:4] == ["0", f"{1.5:.{digits}f}", score]
+
+
+def test_without_a_point_there_is_no_score(tmp_path):
+    """Of a task, or of a suite whose J(T) is of evaluations itself."""
+    write(tmp_path, "cchain", [[1], [2]], "Continual/Walker-v0", suite="dmc", metrics=[(0, "evaluation/mean_return", 1.0)])
+    write(tmp_path, "cchain", [[1], [2]], "Continual/MinAtar-v0", suite="minatar")
+    for result in whole_results(tmp_path):
+        assert result.released_averages()[1] != result.released_averages()[1]
+        assert [cell.paper_scores for cell in make_cells([result])[0].values()] == [(1.5,)]
 
 
 def test_difference_by_hand():
@@ -933,7 +973,14 @@ def test_what_is_missing_by_hand(tmp_path):
     assert f"{command} reduced --env {ACROBOT} --method oracle " in text and f"{command} paper --seeds 3 " in text
     assert missing_section("gym_control", runs, paper, "a comparison") == []
     # 3 seeds of 2 β in 4 environments, at the 510 steps a second of C-CHAIN in the suite's row
-    assert f"{command} reduced --method cchain@1e3 cchain@1e5    # for the best of β: {24 * 256_000 / 510 / 3600:.1f} " in text
+    for lines, rate in (
+        ("cchain@1e3 cchain@1e5", 510),
+        # Nothing is known of its rate but Vanilla's in the suite's row
+        ("weight_clipping@0.1 weight_clipping@0.5 weight_clipping@10", 500),
+        ("l2_init@0.1 l2_init@1 l2_init@100 l2_init@1e3", 480),
+    ):
+        hours = 12 * len(lines.split()) * 256_000 / rate / 3600
+        assert f"{command} reduced --method {lines}    # for the best of several: {hours:,.1f} core-hours" in text
 
 
 def test_nothing_is_missing_of_what_is_whole(tmp_path):
@@ -945,7 +992,7 @@ def test_nothing_is_missing_of_what_is_whole(tmp_path):
     assert "0 runs, 0.0 core-hours" in text and "one cell" not in text
 
 
-# Best of β
+# Best of several strengths
 
 
 def write_betas(folder, scores):
@@ -959,16 +1006,16 @@ def write_betas(folder, scores):
 def test_best_of_betas_by_hand(tmp_path):
     # On the seeds that all have, 1e3 is no longer the best
     write_betas(tmp_path, {None: [-100, -120], "1e3": [-200, -80, 0], "1e5": [-90, -90]})
-    (best,) = best_betas(cells_in(tmp_path), [ACROBOT, CARTPOLE])
+    (best,) = best_strengths("gym_control", cells_in(tmp_path), [ACROBOT, CARTPOLE])
     assert (best.env_id, best.method, best.seeds) == (ACROBOT, "cchain", [0, 1])
-    assert (list(best.cells), best.beta, best.shipped) == (["1e3", "1e4", "1e5"], "1e5", "1e4")
-    row = table_rows(best_table("gym_control", [best], read_tables()["gym_control"]))[2]
-    here = ["-90.0 (best of 3: β = 1e5)", "-110.0 (β = 1e4)", "-119.2 ± 6.9"]
-    assert row == ["Acrobot-v1, C-CHAIN PPO", "1e3, 1e4, 1e5", "0 1", *here, "not enough runs: 2 seeds, other length"]
-    write_best([("gym_control", best)], tmp_path / "best_of.csv")
+    assert (list(best.cells), best.strength, best.shipped) == (["1e3", "1e4", "1e5"], "1e5", "1e4")
+    row = table_rows(best_table([best], read_tables()["gym_control"]))[2]
+    here = ["-90.0 (best of 3: β = 1e5)", "-110.0 (β = 1e4)", "-119.2 ± 6.9 (best of 3)"]
+    assert row == ["Acrobot-v1, C-CHAIN PPO", "β = 1e3, 1e4, 1e5", "0 1", *here, "not enough runs: 2 seeds, other length"]
+    write_best([best], tmp_path / "best_of.csv")
     header, line = (tmp_path / "best_of.csv").read_text().splitlines()
-    assert line == f"gym_control,{ACROBOT},cchain,1e3 1e4 1e5,0 1,1e5,-90.0,1e4,-110.0"
-    assert len(header.split(",")) == len(line.split(","))
+    assert header == ",".join(COLUMNS)
+    assert line == f"gym_control,{ACROBOT},cchain,target_churn_ratio,1e3 1e4 1e5,0 1,1e5,-90.0,1e4,-110.0"
     write_best([], tmp_path / "best_of.csv")
     assert not (tmp_path / "best_of.csv").exists()
 
@@ -977,7 +1024,7 @@ def test_best_of_fewer_betas_than_the_papers_has_no_verdict(tmp_path, no_drawing
     write_betas(tmp_path, {"1e3": [-100, -120]})
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
-    assert "| -110.0 (best of 1: β = 1e3) | – | -119.2 ± 6.9 | not enough runs: β = 1e4, 1e5 missing |" in text
+    assert "| -110.0 (best of 1: β = 1e3) | – | -119.2 ± 6.9 (best of 3) | not enough runs: β = 1e4, 1e5 missing |" in text
     assert "biased upwards" in text and (tmp_path / "out" / "best_of.csv").exists()
 
 
@@ -986,7 +1033,34 @@ def test_best_of_needs_another_beta_and_seeds_in_common(tmp_path, scores):
     write_betas(tmp_path, scores)
     if "1e3" in scores:
         write(tmp_path, "cchain", [[1], [1]], seed=5)
-    assert best_betas(cells_in(tmp_path), [ACROBOT]) == []
+    assert best_strengths("gym_control", cells_in(tmp_path), [ACROBOT]) == []
+
+
+def test_best_of_kappa_and_c(tmp_path, no_drawing):
+    """As of β, each beside the shipped one; what is missing for a verdict is named."""
+    for line, value in (("weight_clipping", -110), ("weight_clipping@0.5", -100), ("l2_init@1", -300), ("l2_init", -200)):
+        run = make_run("gym_control", ACROBOT, line, 0, 2, 100, "smoke")
+        write(tmp_path, run.method, [[value], [value]], variant=run.variant, overrides=run.overrides)
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    rows = [row for row in table_rows(text.split("### Best of several strengths")[1]) if len(row) == 7]
+    kappa, c = (row for row in rows if "(best of" in row[3])
+    assert kappa[:2] == ["Acrobot-v1, Weight clipping", "κ = 0.5, 1"] and c[:2] == ["Acrobot-v1, L2 Init", "c = 1, 10"]
+    assert (
+        kappa[3:5] == ["-100.0 (best of 2: κ = 0.5)", "-110.0 (κ = 1)"] and kappa[6] == "not enough runs: κ = 0.1, 10 missing"
+    )
+    assert c[3:5] == ["-200.0 (best of 2: c = 10)", "-200.0 (c = 10)"] and c[6] == "not enough runs: c = 0.1, 100, 1e3 missing"
+    assert "| Weight clipping, κ = 0.5 |" in text and "optimizer_kwargs=dict(clip_ratio=0.5, base" in text
+    lines = (tmp_path / "out" / "best_of.csv").read_text().splitlines()[1:]
+    assert [line.split(",")[2:7] for line in lines] == [
+        ["weight_clipping", "clip_ratio", "0.5 1", "0", "0.5"],
+        ["l2_init", "coef", "1 10", "0", "10"],
+    ]
+
+
+def test_strengths_of_the_paper():
+    assert paper_strengths("procgen", "l2_init") == ["0.1", "1", "10", "100", "1e3"]
+    assert paper_strengths("dmc", "cchain") == paper_strengths("gym_control", "trac") == []
 
 
 # Normalised by the Oracle

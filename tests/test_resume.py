@@ -44,5 +44,6 @@ def test_is_as_if_it_had_not_been_stopped(tmp_path, name):
     if case.continual:
         returns = (whole / "returns.csv").read_bytes()
         assert returns == (stopped / "returns.csv").read_bytes() and returns.count(b"\n") > 3
-    if (whole / "task_returns.csv").exists():
-        assert (whole / "task_returns.csv").read_bytes() == (stopped / "task_returns.csv").read_bytes()
+    for name in ("task_returns.csv", "evaluations.csv"):
+        if (whole / name).exists():
+            assert (whole / name).read_bytes() == (stopped / name).read_bytes()

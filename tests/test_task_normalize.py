@@ -76,6 +76,36 @@ class Moments:
         return np.clip((values - (mean if centred else 0)) / np.sqrt(var + 1e-8), -limit, limit)
 
 
+class Cut(Noise):
+    """Every second episode is cut, the others end."""
+
+    n_episodes = 0
+
+    def reset(self, **kwargs):
+        self.n_episodes += 1
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        observation, _, ended, _, info = super().step(action)
+        return observation, 1.0, ended and self.n_episodes % 2 == 0, ended and self.n_episodes % 2 == 1, info
+
+
+@pytest.mark.parametrize("returns_over_cuts", [False, True])
+def test_the_discounted_return_over_cuts(returns_over_cuts):
+    """It may go on there, as Gymnasium's. It starts over where an episode ends, and at the switch after step 20."""
+    env = DummyVecEnv([lambda: ContinualEnv([Cut, Cut], 20)])
+    env = TaskVecNormalize(env, gamma=0.5, returns_over_cuts=returns_over_cuts)
+    env.reset()
+    discounted = 0.0
+    for count in range(1, 40):
+        env.step(np.zeros(1, dtype=int))
+        # Of seven steps each, from the first one of a task: cut, ended, and cut by the switch
+        in_task = (count - 1) % 20 + 1
+        begins_new = in_task in (14, 20) or (in_task == 7 and not returns_over_cuts)
+        discounted = 0.0 if begins_new else 0.5 * discounted + 1.0
+        assert (count, env.returns[0]) == (count, pytest.approx(discounted))
+
+
 @pytest.mark.parametrize(
     "n_envs, vec_env_cls, limits",
     [

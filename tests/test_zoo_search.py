@@ -81,7 +81,7 @@ def test_reference_batches_are_searched(algo, sizes):
 
 def test_the_papers_grids():
     grids = {algo: list(BY_ALGO[algo].grid.values()) for algo in ("ppo_weight_clipping", "ppo_l2_init")}
-    assert grids == {"ppo_weight_clipping": [[0.1, 0.5, 1, 10]], "ppo_l2_init": [[0.1, 1, 10, 100, 1000]]}
+    assert grids == {"ppo_weight_clipping": [(0.1, 0.5, 1, 10)], "ppo_l2_init": [(0.1, 1, 10, 100, 1000)]}
 
 
 @pytest.mark.parametrize("method", [method for method in REGISTRY if method.grid], ids=lambda method: method.algo)

@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, split_line, suite_methods
+from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, suite_methods
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
 
@@ -52,12 +53,13 @@ def grid_runs(
     :param suites: Names of suites
     :param env_ids: Environments, by default all of the suites
     :param methods: Methods, in the order in which they are to run, by default all that the paper compares in the suite. A
-        method runs in those of the environments for which it has hyperparameters. ``cchain@1e3`` is C-CHAIN with β 1e3
+        method runs in those of the environments for which it has hyperparameters. ``cchain@1e3`` is C-CHAIN with β 1e3,
+        ``weight_clipping@0.5`` weight clipping with κ 0.5, ``l2_init@10`` L2 Init with c 10
     :param n_seeds: Number of seeds, from 0; by default that of the budget
     :param budget: One of ``BUDGETS``
     :return: The runs, in the order in which they are to run
-    :raises ValueError: For an environment or a method that none of the suites has, a β that cannot be, less than one seed, or
-        when nothing is left
+    :raises ValueError: For an environment or a method that none of the suites has, a strength that cannot be, less than one
+        seed, or when nothing is left
     """
     all_envs = [(suite, env_id) for suite in suites for env_id in SUITES[suite].env_ids]
     available = {name for suite, env_id in all_envs for name in available_methods(suite, env_id)}
@@ -73,11 +75,11 @@ def grid_runs(
         there = available_methods(suite, env_id)
         chosen = [line for line in lines or _same_once(paper_methods(suite)) if line[0] in there]
         n_tasks, steps = run_length(suite, env_id, budget)
-        # At other budgets 30 evaluations in a task, as in the paper
+        # At other budgets as in the paper
         eval_freq = steps if budget == "smoke" else None
         for seed in range(n_seeds or N_SEEDS.get(budget, SUITES[suite].n_paper_seeds)):
-            for rank, (method, beta) in enumerate(chosen):
-                line = method if beta is None else f"{method}@{beta}"
+            for rank, (method, strength) in enumerate(chosen):
+                line = method if strength is None else f"{method}@{strength}"
                 run = make_run(suite, env_id, line, seed, n_tasks, steps, budget, eval_freq)
                 grid.append((seed, rank, run))
     if not grid:
@@ -108,7 +110,7 @@ def shelf_runs(
 
 
 def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:
-    """Methods and β, each pair once, however β is written."""
+    """Methods and strengths, each pair once, however the strength is written."""
     return list(dict.fromkeys(split_line(line) for line in lines or ()))
 
 
@@ -135,7 +137,7 @@ class Rates:
 
     @staticmethod
     def _keys(run: Run) -> tuple[tuple, tuple]:
-        # Another β takes no other time
+        # Another strength takes no other time
         kind = run.experiment == "smoke", run.line.partition("@")[0]
         return (*kind, run.env_id), (*kind, run.suite)
 

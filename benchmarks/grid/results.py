@@ -3,9 +3,9 @@ Finished runs, one small folder each, readable without this package:
 ``<results>/<experiment>/<suite>/<environment>/<method or variant>/seed_<seed>/`` with
 
 - ``run.json``: what was run (:class:`Result` and :class:`~benchmarks.grid.run.Run` name the fields)
-- ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, where the suite evaluates, each evaluation
-- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRIC_PREFIXES``; the
-  header alone where none was logged
+- ``returns.csv``: ``timesteps,task_id,n_episodes,mean_return`` of each rollout or, in MinAtar, each evaluation
+- ``metrics.csv``: ``timesteps,name,value``, the scalars of TensorBoard that begin with one of ``METRIC_PREFIXES``, and what
+  the released code of the paper scores a run by (``released_code.py``); the header alone where none was logged
 """
 
 import csv
@@ -29,9 +29,7 @@ from benchmarks.grid.run import Run, as_json, suite_methods
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 
-# The return of a rollout by the rule of the released code of Gym Control, which counts the episode that the rollout cuts
-WITH_CUT = "continual/mean_return_with_cut"
-METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/", WITH_CUT)
+METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/")
 METRICS_COLUMNS = ("timesteps", "name", "value")
 
 # Names that classes had in the hyperparameters of older results
@@ -116,12 +114,14 @@ class Result(Run):
         averages = task_averages(self.returns)
         return [averages.get(task, math.nan) for task in range(self.n_tasks)]
 
-    def averages_with_cut(self) -> list[float]:
+    def released_averages(self) -> list[float]:
         """
-        :return: As :meth:`task_averages`, of ``WITH_CUT``: NaN for a task without it
+        :return: As :meth:`task_averages`, by the rule of the released code; NaN for a task without a point of it
         """
-        series = [self.metric_in_task(WITH_CUT, task)[1] for task in range(self.n_tasks)]
-        return [float(values.mean()) if len(values) else math.nan for values in series]
+        score = SUITES[self.suite].score
+        if score is None:
+            return [math.nan] * self.n_tasks
+        return [score.average(*self.metric_in_task(score.metric, task)) for task in range(self.n_tasks)]
 
     def returns_in_task(self, task: int) -> Series:
         """

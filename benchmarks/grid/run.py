@@ -1,5 +1,6 @@
 """What a training run is: the command that a user would type, and the settings by which a finished run counts as this one."""
 
+import ast
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -7,15 +8,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from benchmarks.grid.strengths import read_strength, split_line, strength_override, with_strength
 from benchmarks.grid.suites import SUITES, paper_length
-from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, Method
+from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, Method, Strength
 from sb3_cchain.zoo.settings import read_settings
 
 ROOT = Path(__file__).parents[2]
 
-# Of C-CHAIN with another β than the shipped one, in the order of the values
-BETA_COLORS = ("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue")
+# Of a method with another strength than the shipped one, in the order of the values
+STRENGTH_COLORS = ("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Run:
     :param n_tasks: Length of the task sequence
     :param steps_per_task: Environment steps per task
     :param experiment: What the run is part of: a budget of the grid, or the name of a comparison. Names the folder
-    :param eval_freq: Environment steps between two evaluations (ten greedy episodes of the task being trained), or -1
+    :param eval_freq: Environment steps between two evaluations on the task being trained, or -1
     :param variant: Name of the method's variant, None for the method itself
     :param overrides: What differs from the shipped hyperparameters, as after ``--hyperparams`` on the command line
     """
@@ -86,10 +87,30 @@ class Run:
             "seed": self.seed,
             "n_tasks": self.n_tasks,
             "steps_per_task": self.steps_per_task,
-            "eval_freq": self.eval_freq,
+            # Evaluations do not change the training, so they matter only where the returns are theirs
+            "eval_freq": self.eval_freq if SUITES[self.suite].evaluates else -1,
             "overrides": list(self.overrides),
             "hyperparameters": hyperparameters,
         }
+
+    @property
+    def hyperparams(self) -> list[str]:
+        """
+        What stands after ``--hyperparams``: the overrides, and what makes training log the scores. The latter does not change
+        the training, so it is not part of the settings.
+        """
+        suite, overrides = SUITES[self.suite], list(self.overrides)
+        if suite.evaluation is not None and self.eval_freq > 0:
+            given = next((text for text in overrides if text.startswith("callback:")), None)
+            if given is None:
+                callbacks = (shipped_hyperparameters(self.algo, self.env_id) or {})["callback"]
+            else:
+                callbacks = ast.literal_eval(given.removeprefix("callback:"))
+                overrides.remove(given)
+            # After TaskSync, and before what changes the networks at a switch
+            sync, *others = callbacks
+            overrides.append(f"callback:{[sync, suite.evaluation.callback(self.eval_freq), *others]}")
+        return [*overrides, *suite.recording]
 
     def path_in(self, folder: Path) -> Path:
         """
@@ -109,10 +130,10 @@ class Run:
         return [
             *("train", "--algo", self.algo, "--env", self.env_id, "--seed", str(self.seed)),
             *("--n-timesteps", str(self.total_steps), "--num-threads", "1", "--device", device),
-            *("--eval-freq", str(self.eval_freq), "--eval-episodes", "10"),
+            *("--eval-freq", "-1", "--eval-episodes", "10"),
             *("--log-folder", str(folder), "--tensorboard-log", str(folder / "tensorboard"), "--verbose", "0"),
             *("--env-kwargs", *(f"{name}:{value}" for name, value in env_kwargs.items())),
-            *(("--hyperparams", *self.overrides) if self.overrides else ()),
+            *(("--hyperparams", *self.hyperparams) if self.hyperparams else ()),
         ]
 
 
@@ -129,17 +150,17 @@ def make_run(
     """
     :param suite: Name of the suite
     :param env_id: One of its environments
-    :param method: Name of a method, with another β as in ``cchain@1e3``
+    :param method: Name of a method, with another strength as in ``cchain@1e3``
     :param seed: Seed
     :param n_tasks: Length of the task sequence
     :param steps_per_task: Environment steps per task
     :param experiment: What the run is part of
-    :param eval_freq: Environment steps between evaluations where the suite evaluates; by default 30 in a task, as in the paper
+    :param eval_freq: Environment steps between evaluations where the suite evaluates, by default as in the paper
     :return: The run
-    :raises ValueError: When the method has no settings for the environment, for another β that cannot be, for more tasks than
-        the environment has, for no evaluation in a task, or for a negative seed
+    :raises ValueError: When the method has no settings for the environment, for another strength that cannot be, for more
+        tasks than the environment has, for no evaluation in a task, or for a negative seed
     """
-    method, beta = split_line(method)
+    method, strength = split_line(method)
     for argument, value, least in (("seed", seed, 0), ("n_tasks", n_tasks, 1), ("steps_per_task", steps_per_task, 1)):
         if value < least:
             raise ValueError(f"`{argument}` must be at least {least}; got {value}")
@@ -150,69 +171,53 @@ def make_run(
     if "n_tasks" not in SUITES[suite].env_kwargs(n_tasks, seed) and n_tasks > paper_length(env_id)[0]:
         raise ValueError(f"`n_tasks` must be at most {paper_length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
     run = Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
-    if beta is not None:
-        run = replace(run, variant=f"{method}@{beta}", overrides=(beta_override(beta),))
-    if not SUITES[suite].evaluates:
+    if strength is not None:
+        differing = with_strength(_strength(run), run.settings["hyperparameters"], strength)
+        run = replace(run, variant=f"{method}@{strength}", overrides=(strength_override(differing, strength),))
+    evaluation = SUITES[suite].evaluation
+    if evaluation is None:
         return run
-    if not 0 < (steps_per_task // 30 if eval_freq is None else eval_freq) <= steps_per_task:
+    interval = evaluation.interval(steps_per_task) if eval_freq is None else eval_freq
+    if not 0 < interval <= steps_per_task:
         raise ValueError(f"`eval_freq` must be between 1 and `steps_per_task`, which is {steps_per_task}; got {eval_freq}")
-    return replace(run, eval_freq=eval_freq or steps_per_task // 30)
+    return replace(run, eval_freq=interval)
 
 
-def split_line(line: str) -> tuple[str, str | None]:
-    """
-    :param line: Name of a method, with another β as in ``cchain@1e3``
-    :return: Name of the method; and β in its shortest form, so that ``cchain@1000`` is the same run, or None
-    :raises ValueError: When β is not a number greater than 0, or the method has none
-    """
-    method, at, text = line.partition("@")
-    if not at:
-        return line, None
-    with_beta = dict.fromkeys(row.name for row in REGISTRY if issubclass(row.algorithm, ChurnAlgorithm))
-    if method not in with_beta:
-        raise ValueError(f"`method` can have a β after @ for {', '.join(with_beta)} only; got {line}")
-    try:
-        beta = float(text)
-    except ValueError:
-        beta = math.nan
-    if not 0 < beta < math.inf:
-        raise ValueError(f"`method` must have β after @, a number greater than 0, as in {method}@1e3; got {line}")
-    return method, _shortest(beta)
-
-
-def _shortest(number: float) -> str:
-    mantissa, exponent = f"{number:e}".split("e")
-    texts = (f"{number:g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}", repr(number))
-    return min((text for text in texts if float(text) == number), key=len)
-
-
-def beta_override(beta: str) -> str:
-    """
-    :param beta: β of C-CHAIN
-    :return: What differs from the shipped hyperparameters
-    """
-    return f"target_churn_ratio:{beta}"
-
-
-def other_beta(run: Run) -> dict[str, float]:
+def other_strength(run: Run) -> dict[str, Any]:
     """
     :param run: A run
-    :return: β, by its name among the hyperparameters, of a run that differs from the shipped ones in β alone and is named so;
-        empty for every other run
+    :return: The hyperparameter that holds the strength of its method, of a run that differs from the shipped
+        hyperparameters in that strength alone and is named so; empty for every other run
     """
     try:
-        method, beta = split_line(run.variant or "")
+        method, strength = split_line(run.variant or "")
     except ValueError:
         return {}
-    if beta is None or method != run.method or run.overrides != (beta_override(beta),):
+    if strength is None or method != run.method:
         return {}
-    return {"target_churn_ratio": float(beta)}
+    differing = with_strength(_strength(run), run.settings["hyperparameters"], strength)
+    return differing if run.overrides == (strength_override(differing, strength),) else {}
+
+
+def strength_of(run: Run) -> str:
+    """
+    :param run: A run of a method that has a strength
+    :return: The strength in its shortest form
+    :raises ValueError: When it is not among the hyperparameters
+    """
+    return read_strength(_strength(run), {**run.settings["hyperparameters"], **other_strength(run)})
+
+
+def _strength(run: Run) -> Strength:
+    strength = suite_methods(run.suite)[run.method].strength
+    assert strength is not None
+    return strength
 
 
 def lines_in_order(lines: Iterable[str]) -> list[str]:
     """
-    :param lines: Names of methods, some with another β
-    :return: Each once, in the order of the tables: those with another β after their method, by the value
+    :param lines: Names of methods, some with another strength
+    :return: Each once, in the order of the tables: those with another strength after their method, by the value
     """
     return sorted(set(lines), key=lambda line: (METHOD_NAMES.index(split_line(line)[0]), float(split_line(line)[1] or 0)))
 
@@ -220,19 +225,19 @@ def lines_in_order(lines: Iterable[str]) -> list[str]:
 def suite_lines(suite: str, lines: Iterable[str] = ()) -> dict[str, Method]:
     """
     :param suite: Name of a suite
-    :param lines: Names of methods, some with another β
-    :return: Label and colour of all methods of the suite and of those with another β, in the order of the tables
+    :param lines: Names of methods, some with another strength
+    :return: Label and colour of all methods of the suite and of those with another strength, in the order of the tables
     """
     methods = suite_methods(suite)
     colors = dict.fromkeys(methods, 0)
     rows = {}
     for line in lines_in_order([*methods, *lines]):
-        name, beta = split_line(line)
-        rows[line] = methods[name]
-        if beta is not None:
-            color = BETA_COLORS[colors[name] % len(BETA_COLORS)]
+        name, value = split_line(line)
+        rows[line] = method = methods[name]
+        if value is not None and method.strength is not None:
+            color = STRENGTH_COLORS[colors[name] % len(STRENGTH_COLORS)]
             colors[name] += 1
-            rows[line] = replace(methods[name], label=f"{methods[name].label}, β = {beta}", color=color)
+            rows[line] = replace(method, label=f"{method.label}, {method.strength.symbol} = {value}", color=color)
     return rows
 
 

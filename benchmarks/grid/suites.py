@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from benchmarks.grid.released_code import Evaluation, Score
+from sb3_cchain.analysis.eval_trained_task import EVALUATION
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
 
 PROCGEN_ENVS = tuple(f"Continual/{name}" for name, row in CONTINUAL_ENVS.items() if row["entry_point"].endswith("Procgen"))
@@ -38,7 +40,10 @@ class Suite:
     :param algo: Name on the command line of its algorithm without churn reduction
     :param n_paper_seeds: Number of seeds in the paper
     :param reduce_length: From the paper's number of tasks and steps per task to those of the budget ``reduced``
-    :param evaluates: Whether the returns that count are those of greedy evaluations, not of training
+    :param evaluation: How the agent is evaluated, None where the paper does not evaluate
+    :param evaluates: Whether the returns that count in J(T) are those of the evaluations, not of training
+    :param score: How the released code of the paper scores a run, None where that is J(T)
+    :param recording: What makes training log the score, as after ``--hyperparams``
     :param env_kwargs: Further arguments of the environment, from the number of tasks and the seed
     :param own_scales: Whether tasks differ in the size of their returns
     :param visible: Whether a frame shows what the task is
@@ -55,7 +60,10 @@ class Suite:
     n_paper_seeds: int = 6
     # All tasks, a tenth of their lengths; not claimed to be long enough for the paper's effects
     reduce_length: Callable[[int, int], tuple[int, int]] = lambda n_tasks, steps: (n_tasks, steps // 10)
+    evaluation: Evaluation | None = None
     evaluates: bool = False
+    score: Score | None = None
+    recording: tuple[str, ...] = ()
     env_kwargs: Callable[[int, int], dict[str, int]] = lambda n_tasks, seed: {}
     own_scales: bool = False
     visible: bool = True
@@ -86,6 +94,10 @@ SUITES = {
         # All methods meet the same offsets under the same seed
         env_kwargs=lambda n_tasks, seed: {"n_tasks": n_tasks, "offset_seed": seed},
         visible=False,
+        score=Score(
+            "continual/mean_return_with_cut",
+            "The released code also counts the episode that the end of a rollout cuts, with its return so far.",
+        ),
     ),
     "procgen": Suite(
         title="Continual ProcGen",
@@ -99,8 +111,14 @@ SUITES = {
         ),
         checkpoint_freq=10_000,
         env_kwargs=lambda n_tasks, seed: {"n_tasks": n_tasks},
+        score=Score(
+            "rollout/ep_rew_mean",
+            "The released code takes the mean return of the last five episodes that ended, also of those before a switch, at "
+            "every tenth iteration.",
+            interval=10_000,
+        ),
+        recording=("stats_window_size:5",),  # SB3's mean return is of the last five episodes then, not of 100
     ),
-    # The paper evaluates with sampled actions and the normalisation of the moment; the episodes of training have both, too
     "dmc": Suite(
         title="Continual DeepMind Control",
         env_ids=("Continual/Walker-v0", "Continual/Quadruped-v0", "Continual/Dog-v0"),
@@ -115,6 +133,13 @@ SUITES = {
         checkpoint_freq=60_000,
         n_paper_seeds=12,
         own_scales=True,
+        # 10 000 steps of evaluation every 20 000 of training, also in shorter tasks
+        evaluation=Evaluation(per_task=50, deterministic=False, least_interval=20_000),
+        score=Score(
+            EVALUATION,
+            "The released code evaluates on the task being trained every 20,000 steps, by ten episodes with sampled actions "
+            "and the statistics of training. Whether the paper's numbers are of these or of training is not known.",
+        ),
     ),
     "minatar": Suite(
         title="Continual MinAtar",
@@ -130,6 +155,7 @@ SUITES = {
         checkpoint_freq=50_000,
         algo="double_dqn",
         n_paper_seeds=12,
+        evaluation=Evaluation(per_task=30, deterministic=True),
         evaluates=True,
         own_scales=True,
     ),

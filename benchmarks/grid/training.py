@@ -9,18 +9,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from benchmarks.grid.attempts import Attempt, new_attempt
 from benchmarks.grid.results import METRIC_PREFIXES, Result
 from benchmarks.grid.run import Run, as_json, shipped_hyperparameters
 from benchmarks.grid.suites import SUITES, task_names
 from benchmarks.grid.view import Progress
+from sb3_cchain.analysis.eval_trained_task import EVALUATION, EVALUATIONS_CSV
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 
@@ -165,8 +164,13 @@ class Training:
             seconds=max(round(seconds, 1), 0.1),  # by which rates are divided
             peak_memory=self._memory,
         )
-        returns = self._evaluations() if SUITES[run.suite].evaluates else self._training_returns()
-        return Finished(result, returns, metrics_rows(chain))
+        suite, evaluations = SUITES[run.suite], self._evaluations()
+        if suite.evaluates:
+            return Finished(result, evaluations, metrics_rows(chain))
+        # Evaluations are in the log at the end of the next rollout, which may be in the next task
+        logged = [suite.score.metric] if suite.score and suite.score.metric != EVALUATION else []
+        metrics = [*metrics_rows(chain, logged), *evaluation_metrics(evaluations, run)]
+        return Finished(result, self._training_returns(), metrics)
 
     def _has_trained(self) -> bool:
         """Whether there is more than what the checkpoint held that it went on from."""
@@ -179,35 +183,44 @@ class Training:
 
     def _training_returns(self) -> list[dict[str, float]]:
         """Rows of ``returns.csv`` so far."""
-        files = list(self.folder.glob(f"tensorboard/*/*/{RETURNS_CSV}"))
-        return read_returns(files[0]) if files else []
+        return self._rows(RETURNS_CSV)
 
     def _evaluations(self) -> list[dict[str, float]]:
-        """A row like those of ``returns.csv`` for each evaluation."""
-        files = list(self.folder.glob("*/*/evaluations.npz"))
-        if not files:
-            return []
-        logged = np.load(files[0])
-        return [
-            # The step that ends a task is still part of it
-            {
-                "timesteps": int(steps),
-                "task_id": (int(steps) - 1) // self.run.steps_per_task,
-                "n_episodes": len(returns),
-                "mean_return": float(np.mean(returns)),
-            }
-            for steps, returns in zip(logged["timesteps"], logged["results"], strict=True)
-        ]
+        """Rows of ``evaluations.csv``, where the suite evaluates."""
+        return self._rows(EVALUATIONS_CSV)
+
+    def _rows(self, name: str) -> list[dict[str, float]]:
+        files = list(self.folder.glob(f"tensorboard/*/*/{name}"))
+        return read_returns(files[0]) if files else []
 
 
-def metrics_rows(chain: Sequence[Attempt]) -> list[dict[str, Any]]:
+def evaluation_metrics(evaluations: Iterable[Mapping[str, float]], run: Run) -> list[dict[str, Any]]:
+    """
+    :param evaluations: Rows of ``evaluations.csv``
+    :param run: The run
+    :return: Rows of ``metrics.csv``. An evaluation after the last rollout of a task has the step that ended the task
+    """
+    ends = run.task_boundaries
+    return [
+        {
+            "timesteps": min(int(row["timesteps"]), ends[int(row["task_id"])]),
+            "name": EVALUATION,
+            "value": f"{row['mean_return']:.6g}",
+        }
+        for row in evaluations
+    ]
+
+
+def metrics_rows(chain: Sequence[Attempt], further: Sequence[str] = ()) -> list[dict[str, Any]]:
     """
     :param chain: Attempts, each of which goes on from a checkpoint of the one before
+    :param further: Names of scalars that are kept besides those that begin with one of ``METRIC_PREFIXES``
     :return: Rows of ``metrics.csv``: what they logged to TensorBoard, to six digits. What an attempt logged after the
         checkpoint that the next one goes on from is left out, because it comes again
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    beginnings = (*METRIC_PREFIXES, *further)
     # By name, and by environment steps
     values: dict[str, dict[int, list[str]]] = {}
     for attempt, following in zip(chain, [*chain[1:], None], strict=True):
@@ -217,7 +230,7 @@ def metrics_rows(chain: Sequence[Attempt]) -> list[dict[str, Any]]:
             logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
             logged.Reload()
             for name in logged.Tags()["scalars"]:
-                if name.startswith(METRIC_PREFIXES):
+                if name.startswith(beginnings):
                     for event in logged.Scalars(name):
                         if event.step <= last:
                             logged_here.setdefault(name, {}).setdefault(event.step, []).append(f"{event.value:.6g}")

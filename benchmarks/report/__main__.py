@@ -1,7 +1,8 @@
 """
 What the runs of a budget say beside the paper's numbers: verdicts, what is missing, tables, learning curves, rliable's metrics
 and NTK figures, as ``report.md`` with pictures and as ``report.html``, one page that needs nothing beside it. With runs of
-several β there is ``best_of.csv``, the best of them in each environment. Everything is made anew from the result folders.
+several strengths of a method there is ``best_of.csv``, the best of them in each environment. Everything is made anew from the
+result folders.
 
     python -m benchmarks.report --budget reduced
     python -m benchmarks.report --budget reduced paper

@@ -27,15 +27,15 @@ class Cell:
     scores: tuple[float, ...]
 
     @cached_property
-    def scores_with_cut(self) -> tuple[float, ...] | None:
-        """J(T) of each by the rule of the released code (``WITH_CUT``), None unless all runs have logged it in all tasks."""
-        scores = tuple(float(np.mean(result.averages_with_cut())) for result in self.results)
+    def released_scores(self) -> tuple[float, ...] | None:
+        """The score of each by the rule of the released code, None unless all runs have logged it in all tasks."""
+        scores = tuple(float(np.mean(result.released_averages())) for result in self.results)
         return scores if all(map(math.isfinite, scores)) else None
 
     @property
     def paper_scores(self) -> tuple[float, ...]:
         """Those to compare with the paper: by the rule of the released code where it was logged, else the scores."""
-        return self.scores_with_cut or self.scores
+        return self.released_scores or self.scores
 
     @property
     def seeds(self) -> list[int]:

@@ -9,7 +9,7 @@ from benchmarks.grid.results import Result
 from benchmarks.grid.run import (
     as_json,
     lines_in_order,
-    other_beta,
+    other_strength,
     shipped_hyperparameters,
     short_name,
     suite_lines,
@@ -17,7 +17,7 @@ from benchmarks.grid.run import (
 )
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.best_of import WORDS as BEST_WORDS
-from benchmarks.report.best_of import Best, best_betas, best_table, write_best
+from benchmarks.report.best_of import Best, best_strengths, best_table, write_best
 from benchmarks.report.cells import Cells, make_cells
 from benchmarks.report.continual_table import WORDS as CONTINUAL_WORDS
 from benchmarks.report.continual_table import continual_table
@@ -56,16 +56,18 @@ READING = """\
 
 - **J(T)**, what the cells hold, is the average return over the whole of learning, not that of the final policy: the mean
   return of the episodes that ended in a rollout (in MinAtar: of ten greedy episodes of an evaluation), mean over the
-  rollouts of a task in which any ended, mean over the tasks (Eq. 1 of the paper). Greater is better. In DeepMind Control,
-  too, the episodes are those of training, where the paper evaluates every 20,000 steps.
+  rollouts of a task in which any ended, mean over the tasks (Eq. 1 of the paper). Greater is better. Where the released code
+  of the paper scores runs by another rule, that score stands beside J(T), below each suite's table, and the verdicts go by
+  it.
 - **±** is the standard error of the mean over the seeds: their standard deviation (with n - 1) over √n.
 - The **95 % interval** is a percentile bootstrap of the mean over the seeds, 10,000 resamples. With three seeds or fewer it
   reaches from the lowest seed to the highest, and holds the true mean less often than its name says: of three seeds, in
   about three cases of four.
 - **✓** and **✗** are the verdicts of the first section; a cell with neither has not enough runs for one.
 - In Gym Control and ProcGen the **paper's coefficients are tuned**: of C-CHAIN's β, weight clipping's κ and L2 Init's c it
-  reports the best of 3, 4 and 5 values in each environment. Those here are the shipped ones, one of each for a whole suite,
-  and not chosen by the runs that the tables show. They stand below each suite's table.
+  reports the best of 3, 4 and 5 values in each environment. The columns with a method's plain name have the shipped ones, one
+  of each for a whole suite, and not chosen by the runs that the tables show. They stand below each suite's table. With runs of
+  several there is a table of the best, which is marked as that.
 - **Bold** is the best mean, <ins>underlined</ins> the second, without the Oracle, and no second of two methods, as the paper
   marks; of a single method nothing is marked. Marks go by the numbers, in the paper's rows too, and among the cells that are
   there.
@@ -77,8 +79,9 @@ READING = """\
 
 
 RELEASED_WORDS = """\
-The released code also counts the episode that the end of a rollout cuts, with its return so far. Both scores, of the cells
-all of whose runs logged it; the other tables of this page have finished episodes alone."""
+{rule}
+
+Both scores, of the cells all of whose runs logged what it takes. The other tables of this page have J(T)."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
@@ -104,7 +107,7 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
     for result in results:
         if result.suite not in tables or result.env_id not in tables[result.suite].lengths:
             left_out.append(f"{result.path}: the paper has no {result.env_id} in {result.suite}")
-        elif (result.variant is not None or result.overrides) and not other_beta(result):
+        elif (result.variant is not None or result.overrides) and not other_strength(result):
             left_out.append(f"{result.path}: not under the shipped hyperparameters, but with {', '.join(result.overrides)}")
         else:
             by_suite[result.suite].append(result)
@@ -124,8 +127,8 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
         suites="\n".join(contents),
     )
     cells_of = {suite: make_cells(runs) for suite, runs in by_suite.items() if runs}
-    found = {suite: best_betas(cells, list(tables[suite].lengths)) for suite, (cells, _) in cells_of.items()}
-    write_best([(suite, best) for suite, bests in found.items() for best in bests], folder / "best_of.csv")
+    found = {suite: best_strengths(suite, cells, list(tables[suite].lengths)) for suite, (cells, _) in cells_of.items()}
+    write_best([best for bests in found.values() for best in bests], folder / "best_of.csv")
     sight = [
         part
         for suite, (cells, _) in cells_of.items()
@@ -158,7 +161,7 @@ def _suite_section(
     parts += _hyperparameters_section(suite, results, paper)
     parts += _released_section(suite, cells, paper)
     if found:
-        parts += ["### Best of β", BEST_WORDS, best_table(suite, found, paper)]
+        parts += ["### Best of several strengths", BEST_WORDS, best_table(found, paper)]
     parts += reliable_section(suite, cells, paper, pictures)
     parts += _curves_section(suite, results, paper, pictures)
     parts += _continual_section(suite, results, paper)
@@ -179,8 +182,8 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
         notes.append("\n".join(different))
     if any("@" in line for _, line in cells):
         notes.append(
-            "Columns with β = are C-CHAIN under the shipped hyperparameters but for β. The paper has no cells of single β: it "
-            "prints the best of three under C-CHAIN."
+            "Columns with β =, κ = or c = have the shipped hyperparameters but for that strength of the method. The paper has "
+            "no cells of them: it prints the best of several under the method's name."
         )
     most = max((cell.seeds for cell in cells.values()), key=len, default=[])
     fewer: dict[str, list[str]] = {}
@@ -200,21 +203,28 @@ def _notes(suite: str, cells: Cells, paper: Table, left_out: Sequence[str]) -> l
 def _released_section(suite: str, cells: Cells, paper: Table) -> list[str]:
     """J(T) by both rules, of the cells whose runs logged that of the released code."""
     digits = table_digits(paper)
-    rows = []
+    rows, without = [], []
     for env_id, length in paper.lengths.items():
         for method in table_methods(cells, paper):
             cell, figure = cells.get((env_id, method)), paper.figures.get((env_id, method))
-            if cell is None or cell.scores_with_cut is None:
+            if cell is None:
                 continue
-            both = [_score(*mean_and_error(scores), digits) for scores in (cell.scores, cell.scores_with_cut)]
+            name = f"{short_name(env_id)}, {method_label(suite, method)}"
+            if cell.released_scores is None:
+                without.append(name)
+                continue
+            both = [_score(*mean_and_error(scores), digits) for scores in (cell.scores, cell.released_scores)]
             printed = [MISSING, MISSING]
             if figure is not None:
                 printed = [_score(figure.mean, figure.standard_error, digits), verdict_words(cell, figure, length)]
-            rows.append([f"{short_name(env_id)}, {method_label(suite, method)}", seeds_text(cell.seeds), *both, *printed])
-    if not rows:
+            rows.append([name, seeds_text(cell.seeds), *both, *printed])
+    score = SUITES[suite].score
+    if score is None or not rows:
         return []
-    header = ["J(T)", "seeds", "finished episodes", "with the cut one", "paper", "verdict, with the cut one"]
-    return ["### By the rule of the released code", RELEASED_WORDS, markdown_table(header, rows)]
+    header = ["", "seeds", "J(T)", "by the released code", "paper", "verdict, by the released code"]
+    words = RELEASED_WORDS.format(rule=score.words)
+    parts = ["### By the rule of the released code", words, markdown_table(header, rows)]
+    return [*parts, f"Without it: {'; '.join(without)}."] if without else parts
 
 
 def _score(mean: float, error: float | None, digits: int) -> str:
@@ -227,7 +237,7 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
     differences: dict[tuple[str, str], list[str]] = {}
     for env_id, runs in _by_env(results, paper).items():
         vanilla = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
-        shown = {run.line: {**run.hyperparameters, **other_beta(run)} for run in runs if run.method != "vanilla"}
+        shown = {run.line: {**run.hyperparameters, **other_strength(run)} for run in runs if run.method != "vanilla"}
         for method, hyperparameters in shown.items():
             differing = [code(f"{name}: {value}") for name, value in hyperparameters.items() if vanilla.get(name) != value]
             key = method_label(suite, method), ", ".join(differing) or "not in the settings"

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, budget_length
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import Run, lines_in_order, shipped_hyperparameters, short_name, split_line, suite_methods
+from benchmarks.grid.run import Run, lines_in_order, short_name, strength_of
+from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES
-from benchmarks.report.best_of import PAPER_BETAS
+from benchmarks.report.best_of import paper_strengths
 from benchmarks.report.cells import Cells, versions_text
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.paper import AGGREGATE, Table
@@ -22,9 +23,8 @@ WORDS = f"""\
   standard errors. **{DISAGREES}**: as many, and it does not. Overlap is a mild test; wide intervals agree easily.
 - **{TOO_FEW}**: fewer seeds, or another length than the paper's. Such a cell never agrees or disagrees, however close it
   is.
-- What is compared is J(T) as the released code of the paper scores it, where the runs logged that (Gym Control), else J(T) of
-  finished episodes. The paper's C-CHAIN, weight clipping and L2 Init are the best of several coefficients in Gym Control and
-  ProcGen, those here have one."""
+- What is compared is the score by the rule of the released code, where the runs logged that, else J(T). The paper's C-CHAIN,
+  weight clipping and L2 Init are the best of several strengths in Gym Control and ProcGen, those here have the shipped one."""
 
 SIGN_WORDS = """\
 Does C-CHAIN beat Vanilla, as in the paper? The interval is Welch's, of the difference of two means; with two seeds it is
@@ -93,7 +93,7 @@ def missing_runs(
     :param results: Its runs
     :param paper: The paper's table
     :param budget: One of ``BUDGETS``
-    :param lines: Methods, also with another β; by default those of the paper's table
+    :param lines: Methods, also with another strength; by default those of the paper's table
     :return: Those of their runs that are not there
     """
     done = {(run.env_id, run.line, run.seed) for run in results}
@@ -135,9 +135,10 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
     ]
     if missing:
         parts.append(markdown_table(["core-hours", *map(code, paper.methods)], rows))
-    if betas := other_betas(suite):
-        hours = sum(map(rates.seconds, missing_runs(suite, results, paper, budget, betas))) / 3600
-        lines.append(f"{command} --method {' '.join(betas)}    # for the best of β: {hours:,.1f} core-hours")
+    for method in paper.methods:
+        if others := other_strengths(suite, method):
+            hours = sum(map(rates.seconds, missing_runs(suite, results, paper, budget, others))) / 3600
+            lines.append(f"{command} --method {' '.join(others)}    # for the best of several: {hours:,.1f} core-hours")
     if budget != "paper":
         whole = [
             Run(suite, env_id, method, 0, *length, "paper")
@@ -150,14 +151,17 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
     return [*parts, "```bash\n" + "\n".join(lines) + "\n```"]
 
 
-def other_betas(suite: str) -> list[str]:
+def other_strengths(suite: str, method: str) -> list[str]:
     """
     :param suite: Name of the suite
-    :return: C-CHAIN with each of the paper's β but the shipped one
+    :param method: Name of a method
+    :return: The method with each of the paper's strengths but the shipped one
     """
-    shipped = shipped_hyperparameters(suite_methods(suite)["cchain"].algo, SUITES[suite].env_ids[0]) or {}
-    betas = PAPER_BETAS.get(suite, ())
-    return [f"cchain@{beta}" for beta in betas if float(beta) != shipped.get("target_churn_ratio")]
+    strengths = paper_strengths(suite, method)
+    if not strengths:
+        return []
+    shipped = strength_of(Run(suite, SUITES[suite].env_ids[0], method, 0, 1, 1, "paper"))
+    return [f"{method}@{strength}" for strength in strengths if strength != shipped]
 
 
 def _hours(hours: Sequence[float]) -> str:

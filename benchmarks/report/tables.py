@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.grid.results import Result
-from benchmarks.grid.run import lines_in_order, short_name, split_line, suite_lines
+from benchmarks.grid.run import lines_in_order, short_name, suite_lines
+from benchmarks.grid.strengths import split_line
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.estimates import best_two
 from benchmarks.report.markdown import markdown_table
@@ -17,7 +18,7 @@ from benchmarks.report.verdicts import AGREES, DISAGREES, verdict
 def method_label(suite: str, method: str) -> str:
     """
     :param suite: Name of a suite
-    :param method: Name of a method, also with another β
+    :param method: Name of a method, also with another strength
     :return: The method's label in that suite
     """
     return suite_lines(suite, [method])[method].label
@@ -27,7 +28,7 @@ def table_methods(cells: Cells, paper: Table) -> list[str]:
     """
     :param cells: Cells of a suite
     :param paper: The paper's table
-    :return: The methods that are in either, also with another β, in the order of the tables
+    :return: The methods that are in either, also with another strength, in the order of the tables
     """
     return lines_in_order([*paper.methods, *(line for _, line in cells)])
 

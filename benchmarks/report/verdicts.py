@@ -82,7 +82,7 @@ def signs_table(cells: Cells, paper: Table, cchain: str, digits: int) -> str:
         vanilla, churn = cells.get((env_id, "vanilla")), cells.get((env_id, cchain))
         if vanilla is None or churn is None:
             continue
-        by_paper = vanilla.scores_with_cut is not None and churn.scores_with_cut is not None
+        by_paper = vanilla.released_scores is not None and churn.released_scores is not None
         scores = [cell.paper_scores if by_paper else cell.scores for cell in (churn, vanilla)]
         here = difference(*map(sample, scores))
         figures = [paper.figures[env_id, method] for method in ("cchain", "vanilla")]

@@ -45,7 +45,7 @@ class CChainCallback(FiniteCheck):
     :param churn_window: As for ``ChurnAlgorithm``
     :param churn_coef_min: As for ``ChurnAlgorithm``
     :param reset_churn_coef: As for ``ChurnAlgorithm``
-    :param churn_base_loss: As for ``CChainPPO``
+    :param churn_base_loss: As for ``CChainPPO``; ``"last"`` is for PPO alone
     :param churn_component: As for ``CChainPPO``; another one than ``"full"`` is for PPO alone
     :param churn_reference: As for ``CChainPPO``; another one than ``"independent"`` is for PPO and TRPO
     :param churn_batch_size: As for ``CChainPPO``; another one than 1 is for PPO and TRPO
@@ -111,9 +111,11 @@ class CChainCallback(FiniteCheck):
     def _check_options(self, algorithm: str, targets: tuple[str, ...]) -> None:
         default = PolicyChurnOptions()
         has_ppos_references = isinstance(self.model, PPO) or _is_trpo(self.model)
+        holds_ppos_policy = isinstance(self.model, PPO) and targets == ("policy",)
+        is_last = self._options.churn_base_loss == "last"
         for argument, is_known in (
-            ("churn_base_loss", isinstance(self.model, OnPolicyAlgorithm)),
-            ("churn_component", isinstance(self.model, PPO) and targets == ("policy",)),
+            ("churn_base_loss", holds_ppos_policy if is_last else isinstance(self.model, OnPolicyAlgorithm)),
+            ("churn_component", holds_ppos_policy),
             ("churn_reference", has_ppos_references),
             ("churn_batch_size", has_ppos_references),
         ):

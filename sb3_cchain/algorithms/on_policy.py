@@ -11,7 +11,8 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_cchain.algorithms.churn_targets import churn_kind
+from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
+from sb3_cchain.algorithms.last_surrogate import last_surrogate
 from sb3_cchain.algorithms.reference_batches import (
     REFERENCES,
     PreviousRollout,
@@ -36,7 +37,7 @@ from sb3_cchain.validation import check_choice, check_number
 VALUE_CHURN_SAMPLES = 32
 
 # L, by the name in `churn_base_loss`
-BASE_LOSSES = ("actor", "surrogate")
+BASE_LOSSES = ("actor", "surrogate", "last")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class PolicyChurnOptions:
     How the churn of a PPO policy is measured and reduced. The names are those of the arguments.
 
     :param churn_base_loss: What L is: ``"actor"`` for the clipped surrogate and the entropy bonus, ``"surrogate"`` for the
-        clipped surrogate alone
+        clipped surrogate alone, ``"last"`` for that of the last minibatch, and with the churn loss of that minibatch
     :param churn_component: Which component of the churn gradient is used: ``"full"``, ``"projection"`` or ``"orthogonal"``
     :param churn_reference: Where reference batches are taken from: ``"independent"`` or ``"next"``
     :param churn_batch_size: Size of a reference batch in minibatches
@@ -104,6 +105,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
       by the first update of each epoch, unless it is the epoch's only one, on the first 32 samples of its reference batch
 
     With two targets, what belongs to one is logged as ``churn/policy/…`` or ``churn/value/…``. L is averaged over the updates.
+    With ``churn_base_loss="last"``, L and ``churn/loss`` are those of the last update.
 
     :param model: A model of an on-policy algorithm
     :param reducers: Its churn reducers by the name of the target, those with a λ that is not 0
@@ -153,6 +155,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
                 passes = separate_passes(policy, reducers["policy"], references, options.churn_component)
             adders["policy"] = stack.enter_context(passes)
         stack.enter_context(replaced(model.rollout_buffer, "get", references.get))
+        surrogate = stack.enter_context(last_surrogate(model)) if options.churn_base_loss == "last" else None
         stack.enter_context(extra_gradient(policy.optimizer, lambda: before_update(adders)))
         yield
 
@@ -160,11 +163,25 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         if isinstance(references, PreviousRollout):
             reducer.next_reference = references.current
         if reducer.losses:
-            loss = abs(targets[name].base_loss(model, without_entropy=options.churn_base_loss == "surrogate"))
+            loss = _take_losses(model, targets[name], reducer, options, surrogate)
             _log(model.logger, name, "churn" if len(reducers) == 1 else f"churn/{name}", reducer, coefs[name], loss)
             reducer.end_iteration(loss)
     if value_churns:
         model.logger.record("churn/value_churn", np.mean(value_churns))
+
+
+def _take_losses(
+    model: Any,
+    target: ChurnTarget,
+    reducer: ChurnReducer,
+    options: PolicyChurnOptions,
+    surrogate: Callable[[], float] | None,
+) -> float:
+    """|L|. Of the churn losses, those of the updates that count are left."""
+    if surrogate is None:
+        return abs(target.base_loss(model, without_entropy=options.churn_base_loss == "surrogate"))
+    reducer.losses = reducer.losses[-1:]
+    return abs(surrogate())
 
 
 def _log(logger: Logger, name: str, prefix: str, reducer: ChurnReducer, coef: float, loss: float) -> None:

@@ -29,8 +29,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
 
     - the reference batch shares no sample with the minibatch whose update is measured, as the paper demands; the released
       code draws both independently;
-    - λ is adapted to the mean loss over an iteration's updates; in DeepMind Control the released code takes the loss of the
-      last minibatch, which is greater in absolute value;
+    - λ is adapted to the mean losses over an iteration's updates; in DeepMind Control the released code takes those of the
+      last minibatch, as ``churn_base_loss="last"`` does: the surrogate there is greater in absolute value;
     - the old outputs are computed before the update instead of by a copy of the network after it, with the same result.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -47,7 +47,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param reset_churn_coef: Whether λ starts over (warm-up included) when the task switches, as in the released
         code. Off by default, because C-CHAIN does not need to be told of a switch.
     :param churn_base_loss: ``"actor"`` for the clipped surrogate and the entropy bonus, as in the released code's Gym Control;
-        ``"surrogate"`` for the clipped surrogate alone, as in its ProcGen
+        ``"surrogate"`` for the clipped surrogate alone, as in its ProcGen; ``"last"`` for that of the last minibatch, with the
+        churn loss of that minibatch, as in its DeepMind Control
     :param churn_component: Which component of the churn gradient is used: ``"full"``, or, as the paper's ablation does
         (Section 5.2), only its ``"projection"`` on PPO's gradient of the actor's parameters or the ``"orthogonal"`` rest.
         It is added before the gradient is clipped.
@@ -85,6 +86,10 @@ class CChainPPO(ChurnAlgorithm, PPO):
         if self.churn_component != "full" and self.churn_target in ("value", "both"):
             raise ValueError(
                 f'`churn_component` must be "full" unless `churn_target` is "policy", got {self.churn_component!r}'
+            )
+        if self.churn_base_loss == "last" and self.churn_target in ("value", "both"):
+            raise ValueError(
+                '`churn_base_loss` must be "actor" or "surrogate" unless `churn_target` is "policy", got \'last\''
             )
         return PolicyChurnOptions(self.churn_base_loss, self.churn_component, self.churn_reference, self.churn_batch_size)
 

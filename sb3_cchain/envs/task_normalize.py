@@ -45,11 +45,16 @@ class TaskVecNormalize(VecNormalize):
     :param epsilon: Added to variances
     :param norm_obs_keys: The parts of a ``Dict`` observation to normalise
     :param restart: Whether the statistics restart at a switch
-    :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward`` or ``restart`` is not a boolean
+    :param returns_over_cuts: Whether the discounted return that scales the rewards goes on over an episode that is cut, by a
+        limit of time, into the next one, as in Gymnasium's ``NormalizeReward``. It starts over at a switch in any case
+    :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward``, ``restart`` or ``returns_over_cuts`` is not a boolean
     """
 
     # Attributes that a saved TaskVecNormalize goes on with; the switches know the task that the statistics are of
     statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch", "_signal_switch"})
+
+    # Those that were saved by an earlier version do not have it
+    returns_over_cuts: bool = False
 
     def __init__(
         self,
@@ -64,12 +69,14 @@ class TaskVecNormalize(VecNormalize):
         norm_obs_keys: list[str] | None = None,
         *,
         restart: bool = True,
+        returns_over_cuts: bool = False,
     ):
         flags = {"training": training, "norm_obs": norm_obs, "norm_reward": norm_reward, "restart": restart}
-        for name, flag in flags.items():
+        for name, flag in (flags | {"returns_over_cuts": returns_over_cuts}).items():
             check_bool(name, flag)
         super().__init__(venv, training, norm_obs, norm_reward, clip_obs, clip_reward, gamma, epsilon, norm_obs_keys)
         self.restart = restart
+        self.returns_over_cuts = returns_over_cuts
         # Of no task before the first step, and where tasks have no number
         self._switch = TaskSwitch()
         # The same by the word of a TaskSignal, which may number tasks otherwise
@@ -118,7 +125,7 @@ class TaskVecNormalize(VecNormalize):
         observations = self.normalize_obs(self.old_obs)
         if not switch:
             self._normalize_terminal(dones, infos)
-        self.returns[dones] = 0
+        self.returns[dones if switch else self._ends_return(dones, infos)] = 0
         return observations, rewards, dones, infos
 
     def _follows_tasks(self) -> bool:
@@ -131,6 +138,12 @@ class TaskVecNormalize(VecNormalize):
         switched = self._switch.happened(first_reset_info(self.venv).get(TASK_KEY))
         signal = active_signal(self.venv)
         return switched if signal is None else self._signal_switch.happened(signal.next_task)
+
+    def _ends_return(self, dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
+        """Which environments begin a new return."""
+        if not self.returns_over_cuts or not any(dones.tolist()):
+            return dones
+        return dones & ~np.array([info.get("TimeLimit.truncated", False) for info in infos])
 
     def _restart(self) -> None:
         if self.norm_obs:

@@ -52,6 +52,21 @@ from sb3_cchain.networks import (
 
 
 @dataclass(frozen=True)
+class Strength:
+    """
+    The one number that says how strongly a method acts: what stands after ``@`` in ``l2_init@10``.
+
+    :param argument: Its name: a hyperparameter, or an argument of the optimiser wrapper
+    :param symbol: What papers call it
+    :param paper_values: Those of which the paper reports the best in each environment of Gym Control and ProcGen
+    """
+
+    argument: str
+    symbol: str
+    paper_values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Method:
     """
     A method, as settings of an algorithm.
@@ -70,6 +85,7 @@ class Method:
     :param policy_kwargs: Arguments of that policy
     :param grid: Values that ``-optimize`` searches, by argument of the optimiser wrapper or, where there is none, of the first
         of ``callbacks``
+    :param strength: Its strength, where the paper takes the best of several
     """
 
     name: str
@@ -85,6 +101,7 @@ class Method:
     policy: str | type[BasePolicy] = "MlpPolicy"
     policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
     grid: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    strength: Strength | None = None
 
     @property
     def in_paper(self) -> bool:
@@ -99,6 +116,10 @@ class Method:
 
 PPO_SUITES = ("gym_control", "procgen", "dmc")
 OPTIMIZER_PAGE, PLASTICITY_PAGE, FAMILY_PAGE = "modules/optimizers", "modules/plasticity", "modules/family"
+
+BETA = Strength("target_churn_ratio", "β", (1e3, 1e4, 1e5))
+KAPPA = Strength("clip_ratio", "κ", (0.1, 0.5, 1.0, 10.0))
+C = Strength("coef", "c", (0.1, 1.0, 10.0, 100.0, 1000.0))
 
 
 def _family() -> Iterator[Method]:
@@ -122,7 +143,7 @@ def _family() -> Iterator[Method]:
         }
     for name, algorithm in algorithms.items():
         label = f"C-CHAIN {algorithm.__name__.removeprefix('CChain')}"
-        yield Method("cchain", f"{name}_cchain", algorithm, label, "tab:blue", FAMILY_PAGE)
+        yield Method("cchain", f"{name}_cchain", algorithm, label, "tab:blue", FAMILY_PAGE, strength=BETA)
 
 
 # In the order of the report's tables
@@ -143,13 +164,15 @@ REGISTRY = (
         suites=("gym_control", "procgen"),
         optimizer_class=WeightClipping,
         callbacks=(OptimizerMetrics,),
-        grid={"clip_ratio": [0.1, 0.5, 1.0, 10.0]},  # the paper's
+        grid={KAPPA.argument: KAPPA.paper_values},
+        strength=KAPPA,
     ),
     Method(
         *("l2_init", "ppo_l2_init", PPO, "L2 Init", "tab:red", OPTIMIZER_PAGE, ("gym_control", "procgen")),
         optimizer_class=L2Init,
         callbacks=(OptimizerMetrics,),
-        grid={"coef": [0.1, 1.0, 10.0, 100.0, 1000.0]},  # the paper's
+        grid={C.argument: C.paper_values},
+        strength=C,
     ),
     Method(
         *("layer_norm", "ppo_layer_norm", PPO, "LayerNorm", "tab:purple", PLASTICITY_PAGE, ("procgen",)),
@@ -268,8 +291,8 @@ REGISTRY = (
         policy=SimBaPolicy,
         policy_kwargs={"net_arch": {"pi": [128], "vf": [512, 512]}},
     ),
-    Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES),
-    Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",)),
+    Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES, strength=BETA),
+    Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",), strength=BETA),
     *_family(),
 )
 

@@ -19,7 +19,8 @@ LAYOUT: dict[str, dict[str, str]] = {
         "Task being trained": "continual/task_id",
         "Reward per episode": "rollout/ep_rew_mean|eval/mean_reward",
     },
-    "Evaluations on all tasks": {
+    "Evaluations on the tasks": {
+        "Mean return on the task being trained": "evaluation/mean_return",
         "Mean return on each task": r"continual_eval/task_\d+",
         "Mean return over all tasks": "continual_eval/average",
         "Forgetting, mean over the tasks that were left": "continual_eval/forgetting",

@@ -1,0 +1,18 @@
+"""Episodes that are cut count as ended."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+
+class NoBootstrapAtCuts(BaseCallback):
+    """
+    Makes an algorithm take an episode that is cut, by a limit of time or by a switch, for one that ended: no value stands for
+    the rest of it. SB3 bootstraps there. The code released with the paper does not in DeepMind Control, whose episodes are all
+    cut after 1000 steps.
+
+    Give it as the last of the callbacks, because it changes what the others are told (``TimeLimit.truncated``).
+    """
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            info["TimeLimit.truncated"] = False
+        return True

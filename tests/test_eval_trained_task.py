@@ -1,0 +1,59 @@
+"""Evaluation on the task being trained."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.logger import Logger
+
+from sb3_cchain import CChainPPO, TaskSync
+from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask
+from sb3_cchain.callbacks import read_returns
+from sb3_cchain.tensorboard.layout import layout_of
+from tests.resume_cases import Record
+from tests.test_eval_all_tasks import ARGUMENTS, tasks
+
+
+def test_evaluates_before_training_at_intervals_and_right_after_each_task(tmp_path):
+    """The tasks have returns of 7, 14 and 21, and 32 steps."""
+    record = Record()
+    model = CChainPPO("MlpPolicy", tasks(), **ARGUMENTS)
+    model.set_logger(Logger(None, [record]))
+    model.learn(96, callback=EvalTrainedTask(tasks(), path=tmp_path / "evaluations.csv", n_eval_episodes=2, interval=16))
+    rows = read_returns(tmp_path / "evaluations.csv")
+    assert rows == model.evaluations and {row["n_episodes"] for row in rows} == {2}
+    assert [(row["timesteps"], row["task_id"], row["mean_return"]) for row in rows] == [
+        *((0, 0, 7), (16, 0, 7), (32, 0, 7), (48, 1, 14), (64, 1, 14), (80, 2, 21), (96, 2, 21)),
+    ]
+    # At the end of the rollout after the evaluation, the last one at once
+    logged = [(step, row["evaluation/mean_return"]) for step, row in record.rows if "evaluation/mean_return" in row]
+    assert logged == [(16, 7), (32, 7), (48, 7), (64, 14), (80, 14), (96, 21), (96, 21)]
+    assert layout_of({"evaluation/mean_return"}) == {
+        "Evaluations on the tasks": {"Mean return on the task being trained": "evaluation/mean_return"}
+    }
+
+
+def test_off_policy_it_is_at_the_very_step():
+    arguments = dict(learning_starts=8, batch_size=8, train_freq=1, policy_kwargs=dict(net_arch=[8]), seed=0)
+    model = DQN("MlpPolicy", tasks(), **arguments)
+    model.learn(64, callback=[TaskSync(), EvalTrainedTask(tasks(), n_eval_episodes=1, interval=10)])
+    at = [(row["timesteps"], row["task_id"]) for row in model.evaluations]
+    assert at == [(0, 0), (10, 0), (20, 0), (30, 0), (32, 0), (40, 1), (50, 1), (60, 1), (64, 1)]
+
+
+def test_it_goes_with_evaluations_on_all_tasks():
+    model = PPO("MlpPolicy", tasks(), **ARGUMENTS)
+    callbacks = [EvalTrainedTask(tasks(), n_eval_episodes=1), EvalAllTasks(tasks(), n_eval_episodes=1)]
+    model.learn(64, callback=[TaskSync(), *callbacks])
+    on_all = [row["mean_return"] for row in model.task_returns if row["task_id"] == row["trained_task"]]
+    assert [row["mean_return"] for row in model.evaluations] == on_all == [7, 7, 14]
+    with pytest.raises(ValueError, match="EvalTrainedTask"):
+        model.learn(16, callback=[TaskSync(), callbacks[0], EvalTrainedTask(tasks())])
+
+
+def test_sampled_actions_leave_training_as_it_is():
+    parameters = []
+    for callbacks in ([], [EvalTrainedTask(n_eval_episodes=1, interval=16, deterministic=False)]):
+        model = PPO("MlpPolicy", "Continual/CartPole-v1", **ARGUMENTS).learn(48, callback=[TaskSync(), *callbacks])
+        parameters.append(model.policy.state_dict())
+    assert len(model.evaluations) == 4
+    assert all(np.array_equal(parameters[0][name], parameters[1][name]) for name in parameters[0])
