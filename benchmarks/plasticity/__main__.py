@@ -1,5 +1,5 @@
 """
-How churn, the neural tangent kernel (NTK) and the networks develop over the tasks: of Vanilla, TRAC and C-CHAIN, and of C-CHAIN
+How churn, the neural tangent kernel (NTK) and the networks develop over the tasks: of PPO, TRAC and C-CHAIN, and of C-CHAIN
 with one component of its gradient alone (the figures and the ablation of Section 5.2 of the paper). Trains with the monitors.
 The same command goes on where it was interrupted.
 
@@ -38,8 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--method",
         nargs="+",
-        help=f"Methods of the suite, and {', '.join(COMPONENTS)} for one component of C-CHAIN's gradient alone; by default all "
-        "that the paper's analysis compares",
+        help=f"Methods of the suite, and {', '.join(COMPONENTS)} for C-CHAIN with one component of its gradient; by default "
+        "all that the paper's analysis compares",
     )
     parser.add_argument("--budget", default="reduced", choices=BUDGETS, help="Length of the runs, as of benchmarks.run")
     parser.add_argument("--n-tasks", type=int, help="Length of the task sequence, by default the budget's")

@@ -48,7 +48,7 @@ def write_snapshots(matrices: dict[int, np.ndarray], path: Path) -> None:
     :param path: File
     """
     with write_safely(path) as unfinished, open(unfinished, "wb") as file:
-        np.savez_compressed(file, **{str(steps): matrix for steps, matrix in matrices.items()})  # type: ignore[arg-type]
+        np.savez_compressed(file, **{str(steps): matrix for steps, matrix in matrices.items()})
 
 
 def read_snapshots(result: Result) -> dict[int, np.ndarray]:
