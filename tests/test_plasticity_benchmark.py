@@ -13,7 +13,7 @@ from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import write_result
 from benchmarks.plasticity.__main__ import main
-from benchmarks.plasticity.heat_maps import cosines
+from benchmarks.plasticity.heat_maps import cosines, plot_heat_maps
 from benchmarks.plasticity.page import read_groups, table
 from benchmarks.plasticity.runs import COMPONENTS, default_names, lines, quantities, snapshot_times, watched_run
 from benchmarks.plasticity.snapshots import FILE, NTKSnapshots, keep_snapshots, read_snapshots, write_snapshots
@@ -91,11 +91,15 @@ def test_watched_runs_tell_nothing_about_the_time_of_others(tmp_path):
     assert rates.seconds(make_result(tmp_path, watched, experiment="paper")) == pytest.approx(1600 / 500)
 
 
+def test_dqn_has_no_components():
+    with pytest.raises(ValueError, match=r"`method` must not be a component .* in minatar, which has none; got projection"):
+        watched_run("minatar", "projection", "Continual/MinAtar-v0", 0, 2, 800)
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
         (["--steps-per-task", "0"], "`steps_per_task` must be at least 1; got 0"),
-        (["--suite", "minatar", "--method", "projection"], "`method` must not be a component"),
         (["--suite", "procgen", "--env", ACROBOT], "--env must be one of Continual/BigFish-v0"),
         (["--method", "nonsense"], "`method` must be one of"),
     ],
@@ -173,6 +177,20 @@ def test_cosines_by_hand():
     assert np.allclose(cosines(matrix)[:3, :3], expected) and np.isnan(cosines(matrix)[3]).all()
 
 
+def test_each_matrix_is_drawn_at_its_time(tmp_path):
+    write(tmp_path, "vanilla", 1.0, matrices={800: np.eye(3), 1200: np.ones((3, 3)), 1600: np.zeros((3, 3))})
+    write(tmp_path, "cchain", 1.0, matrices={1592: np.array([[2.0, -1], [-1, 2]])})
+    (results,) = read_groups(tmp_path)
+    figure = plot_heat_maps(results, lines("gym_control"), tmp_path / "ntk.png", "title")
+    assert [panel.get_title() for panel in figure.axes[:6]] == [
+        "step 800\nsrank 3, off-diagonal sum 0",
+        "step 1 200\nsrank 1, off-diagonal sum 6",
+        "step 1 600\nsrank 0, off-diagonal sum 0",
+        *("step 800\nno matrix", "step 1 200\nno matrix", "step 1 592\nsrank 2, off-diagonal sum 2"),
+    ]
+    assert [panel.get_ylabel() for panel in figure.axes[:4:3]] == ["PPO, seed 0", "C-CHAIN PPO, seed 0"]
+
+
 def test_a_table_by_hand(tmp_path):
     for seed, srank in ((0, 7.0), (1, 8.0)):
         write(tmp_path, "cchain", srank, seed=seed)
@@ -188,7 +206,6 @@ def test_the_page_comes_from_the_results_alone(tmp_path):
     (tmp_path / "docs").mkdir()
     page = tmp_path / "docs/plasticity.md"
     page.write_text("<!-- table: plasticity -->\n\n<!-- end -->\n")
-    write(tmp_path / "results", "vanilla", 1.0, matrices={800: np.eye(3), 1200: np.ones((3, 3)), 1600: np.zeros((3, 3))})
     write(tmp_path / "results", "cchain", 3.0, matrices={800: np.eye(3)})
     write(tmp_path / "results", "vanilla", 5.0, "procgen", "Continual/Starpilot-v0")
     command(tmp_path, "--write")

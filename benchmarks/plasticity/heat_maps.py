@@ -1,12 +1,15 @@
 """The neural tangent kernels (NTKs) of several methods, at several times, as pictures."""
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
 
 from benchmarks.grid.results import Result
+from benchmarks.plasticity.runs import snapshot_times
 from benchmarks.plasticity.snapshots import read_snapshots
 from benchmarks.report.task_tables import in_order
 from sb3_cchain.analysis.metrics.ntk import ntk_statistics
@@ -25,7 +28,7 @@ def cosines(matrix: np.ndarray) -> np.ndarray:
         return matrix / np.outer(lengths, lengths)
 
 
-def plot_heat_maps(results: Sequence[Result], lines: Mapping[str, Method], path: Path, title: str) -> bool:
+def plot_heat_maps(results: Sequence[Result], lines: Mapping[str, Method], path: Path, title: str) -> Any:
     """
     Draw a row for each method, of its first seed that has matrices, and a column for each time.
 
@@ -33,32 +36,32 @@ def plot_heat_maps(results: Sequence[Result], lines: Mapping[str, Method], path:
     :param lines: Label of each method, in their order
     :param path: PNG file
     :param title: Title
-    :return: Whether there was a matrix to draw
+    :return: The figure, None where there is no matrix to draw
     """
     rows: dict[str, tuple[Result, dict[int, np.ndarray]]] = {}
     for result in in_order(results, lines):
         if result.line not in rows and (matrices := read_snapshots(result)):
             rows[result.line] = result, matrices
     if not rows:
-        return False
-    n_columns = max(len(matrices) for _, matrices in rows.values())
+        return None
+    times = snapshot_times(results[0])
     matplotlib = import_matplotlib()
-    figure = matplotlib.figure.Figure(figsize=(2.9 * n_columns + 1, 3.1 * len(rows) + 0.7), dpi=100, layout="constrained")
-    panels = figure.subplots(len(rows), n_columns, squeeze=False)
+    figure = matplotlib.figure.Figure(figsize=(2.9 * len(times) + 1, 3.1 * len(rows) + 0.7), dpi=100, layout="constrained")
+    panels = figure.subplots(len(rows), len(times), squeeze=False)
     image = None
     for row, (line, (result, matrices)) in zip(panels, rows.items(), strict=True):
-        for panel in row:
-            panel.set(xticks=[], yticks=[])
         row[0].set_ylabel(f"{lines[line].label}, seed {result.seed}")
-        for panel, (steps, matrix) in zip(row, matrices.items(), strict=False):
+        for panel, end in zip(row, times, strict=True):
+            panel.set(xticks=[], yticks=[])
+            panel.set_title(f"step {end:,}\nno matrix".replace(",", " "), fontsize=9)
+        for steps, matrix in matrices.items():
+            panel = row[bisect_left(times, steps)]
             image = panel.imshow(cosines(matrix), cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
             numbers = ntk_statistics(th.as_tensor(matrix, dtype=th.float64))
             shown = f"srank {numbers['srank']}, off-diagonal sum {numbers['off_diagonal_sum']:.2g}"
-            panel.set_title(f"step {steps:,}".replace(",", " ") + f"\n{shown}", fontsize=9)
-        for panel in row[len(matrices) :]:
-            panel.text(0.5, 0.5, "no matrix", ha="center", va="center", transform=panel.transAxes)
+            panel.set_title(f"step {steps:,}\n".replace(",", " ") + shown, fontsize=9)
     figure.colorbar(image, ax=panels, label="cosine of two minibatches' gradients", shrink=0.6)
     figure.suptitle(title, parse_math=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
-    return True
+    return figure

@@ -49,13 +49,13 @@ def section(results: Sequence[Result], docs: Path) -> str:
     run = results[0]
     labels = lines(run.suite, [result.line for result in results])
     env, steps = short_name(run.env_id), f"{run.steps_per_task:,}".replace(",", " ")
-    seeds = seeds_text(sorted({result.seed for result in results}))
-    title = f"{env}, {run.n_tasks} tasks of {steps} steps, seeds {seeds}"
+    seeds = sorted({result.seed for result in results})
+    title = f"{env}, {run.n_tasks} tasks of {steps} steps, {'seeds' if len(seeds) > 1 else 'seed'} {seeds_text(seeds)}"
     name = f"{PICTURES}/{env}_{run.n_tasks}x{run.steps_per_task}"
     parts = [f"### {env}, {run.n_tasks} × {steps} steps", table(results)]
     (docs / PICTURES).mkdir(parents=True, exist_ok=True)
     plot_quantities(results, docs / f"{name}.png", labels, quantities(run.suite), title, window=5)
     parts.append(f"![Returns, NTK, churn and dormant units over the tasks of {env}](../{name}.png)")
-    if plot_heat_maps(results, labels, docs / f"{name}_ntk.png", f"NTK, {title}"):
+    if plot_heat_maps(results, labels, docs / f"{name}_ntk.png", f"NTK, {title}") is not None:
         parts.append(f"![The NTK at three times of the training on {env}](../{name}_ntk.png)")
     return "\n\n".join(parts)
