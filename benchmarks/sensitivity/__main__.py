@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("\n\n".join(tables.values()))
     if args.write:
         n_tasks, steps = runs[0].n_tasks, f"{runs[0].steps_per_task:,}".replace(",", " ")
-        plot(scores, costs, args.docs / PICTURE, f"{n_tasks} tasks of {steps} steps; dots are seeds, grey: no run yet")
+        plot(scores, costs, args.docs / PICTURE, f"{n_tasks} tasks of {steps} steps")
         write_tables(tables, args.docs)
 
 

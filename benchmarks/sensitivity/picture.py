@@ -15,7 +15,7 @@ from sb3_cchain.analysis.plots import import_matplotlib
 def plot(scores: Mapping[str, tuple[Scores, Scores]], costs: Mapping[str, Mapping[str, Cost]], path: Path, title: str) -> Any:
     """
     Draw a row of panels for each parameter and a column for each environment: dots are seeds, the line goes through their
-    means, the dashed line is PPO. Values without a run are grey.
+    means, the dashed line is PPO, the dotted ones its seeds. Values without a run are grey.
 
     :param scores: J(T) of C-CHAIN PPO and of PPO, by key of ``PARAMETERS``
     :param costs: Processor time, by environment and model
@@ -61,9 +61,12 @@ def _draw(
             panel.plot([place], [mean], "_", color=cchain.color, markersize=14, markeredgewidth=2)
         else:
             panel.axvspan(place - 0.4, place + 0.4, color="0.93", zorder=0)
-            panel.text(place, 0.5, "no run", color="0.5", rotation=90, ha="center", va="center", **_across(panel))
+            panel.text(place, 0.97, "no run", color="0.5", rotation=90, ha="center", va="top", **_across(panel))
     if base:
         panel.axhline(np.mean(list(base.values())), color=ppo.color, linestyle="--", linewidth=1.2, label=f"{ppo.label}, mean")
+    for score in base.values():
+        seed = panel.axhline(score, color=ppo.color, linestyle=":", linewidth=0.9)
+        seed.set_label(f"{ppo.label}, seeds")
     labels = []
     for value in values:
         shipped = "\nshipped" if parameter.is_shipped(value, env_id) else ""
