@@ -49,7 +49,7 @@ def write(folder, name, srank, suite="gym_control", env_id=ACROBOT, matrices=Non
     [
         ("gym_control", ACROBOT, ["vanilla", "trac", "cchain", *COMPONENTS]),
         ("procgen", "Continual/Chaser-v0", ["vanilla", "trac", "cchain", *COMPONENTS]),
-        ("dmc", "Continual/Walker-v0", ["vanilla", "cchain", *COMPONENTS]),
+        ("dmc", "Continual/Walker-v0", ["vanilla", "trac", "cchain", *COMPONENTS]),
         ("minatar", "Continual/MinAtar-v0", ["vanilla", "cchain"]),
     ],
 )
