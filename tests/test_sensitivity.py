@@ -162,7 +162,7 @@ def test_the_picture_shows_what_is_missing(results, tmp_path):
     beta_acrobot, _, size_acrobot, _ = figure.axes
     # PPO's level
     assert [line.get_ydata()[0] for line in beta_acrobot.lines if line.get_linestyle() == "--"] == [-275.0]
-    assert [label.get_text() for label in size_acrobot.get_xticklabels()][-1] == "8\n1.20 × PPO"
+    assert [label.get_text() for label in size_acrobot.get_xticklabels()][-1] == "8\n1.20×"
 
 
 def test_the_page_comes_from_the_results_alone(results, tmp_path):

@@ -70,11 +70,11 @@ def _draw(
     labels = []
     for value in values:
         shipped = "\nshipped" if parameter.is_shipped(value, env_id) else ""
-        cost = f"\n{costs[value].ratios[0]:.2f} × PPO" if value in costs else ""
+        cost = f"\n{costs[value].ratios[0]:.2f}×" if value in costs else ""
         labels.append(f"{value}{cost}{shipped}")
     panel.set_xticks(range(len(labels)), labels, fontsize=8)
     panel.set_xlim(-0.6, len(labels) - 0.4)
-    panel.set_xlabel(f"{parameter.label}; time of an iteration" if costs else parameter.label)
+    panel.set_xlabel(f"{parameter.label}\nand time of an iteration / PPO's" if costs else parameter.label)
     panel.spines[["top", "right"]].set_visible(False)
 
 
