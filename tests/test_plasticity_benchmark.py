@@ -16,7 +16,7 @@ from benchmarks.plasticity.__main__ import main
 from benchmarks.plasticity.heat_maps import cosines, plot_heat_maps
 from benchmarks.plasticity.page import read_groups, table
 from benchmarks.plasticity.runs import COMPONENTS, default_names, lines, quantities, snapshot_times, watched_run
-from benchmarks.plasticity.snapshots import FILE, NTKSnapshots, keep_snapshots, read_snapshots, write_snapshots
+from benchmarks.plasticity.snapshots import FILE, NTKSnapshots, read_snapshots, write_snapshots
 from sb3_cchain.checkpoint import TrainingCheckpoint, find_checkpoint, resume
 from tests.fake_training import fake_program
 from tests.test_grid import make_result
@@ -119,12 +119,13 @@ def test_the_command_trains_once_and_keeps_the_ntk(tmp_path, capsys, monkeypatch
     assert "2 runs, 0 of them done" in capsys.readouterr().out and not (tmp_path / "logs").exists()
     command(tmp_path, *arguments)
     assert "| return per episode | orthogonal alone | 0 | -10 | -20 |" in capsys.readouterr().out
-    # The matrices that the stand-in does not write, as if the command had been interrupted before they were kept
+    # The matrices that the stand-in does not write: they are also kept when another run fails
     ((result, _),) = read_groups(tmp_path / "results")
     logs = next(result.path_in(tmp_path / "logs").glob("attempt_*/tensorboard/*/*"))
     write_snapshots({800: np.eye(2)}, logs / FILE)
-    monkeypatch.setattr("benchmarks.grid.executor.LocalBackend", None)
-    keep_snapshots(result, tmp_path / "logs")
+    fake_program(tmp_path / "fake", {1: ["fail"]})
+    with pytest.raises(SystemExit, match="seed 1 failed: ValueError: boom"):
+        command(tmp_path, *arguments, "1")
     assert list(read_snapshots(result)) == [800]
 
 

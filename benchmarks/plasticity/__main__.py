@@ -17,6 +17,7 @@ from rich.console import Console
 
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS, run_length
+from benchmarks.grid.results import find_result
 from benchmarks.grid.run import ROOT, Run
 from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.page import read_groups, section, table
@@ -66,9 +67,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.dry_run:
         list_grid(runs, args.results, args.logs, Console())
         return
-    results = train_all(runs, args.results, args.jobs, args.logs)
-    for result in results:
-        keep_snapshots(result, args.logs)
+    try:
+        results = train_all(runs, args.results, args.jobs, args.logs)
+    finally:  # also when only some of them were done before it was interrupted
+        for result in filter(None, (find_result(run, args.results) for run in runs)):
+            keep_snapshots(result, args.logs)
     for env_id in dict.fromkeys(run.env_id for run in runs):
         print(f"\n{env_id}\n\n{table([result for result in results if result.env_id == env_id])}")
     print(f"\nResults: {args.results}. Pictures: python -m benchmarks.plasticity --write")
