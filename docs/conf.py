@@ -77,6 +77,7 @@ CONTENTS = {
         "Other algorithms <results/family>",
         "Supervised learning <results/supervised>",
         "Reference batches <results/references>",
+        "β and size of the reference batch <results/sensitivity>",
         "Speed <results/speed>",
     ],
     "Project": ["comparison", "contributing", "changelog", "citing"],

@@ -1,4 +1,4 @@
-"""The commands ``demo``, ``compare``, ``plasticity`` and ``references``, with a training command that starts at once."""
+"""The commands ``demo``, ``compare`` and ``references``, with a training command that starts at once."""
 
 import subprocess
 import sys
@@ -6,11 +6,10 @@ from functools import partial
 
 import pytest
 
-from benchmarks import compare, demo, plasticity, references
+from benchmarks import compare, demo, references
 from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, make_run
-from benchmarks.plasticity import LINES, variant_run
 from benchmarks.report.random_policy import look_at_task
 from tests.fake_training import fake_program
 
@@ -68,21 +67,6 @@ def test_compare(run_command, tmp_path, capsys):
     assert is_picture(tmp_path / "out" / folder / "curves.png")
 
 
-def test_plasticity(run_command, tmp_path, capsys):
-    folder = "plasticity_2x800/gym_control/Continual-Acrobot-v1"
-    assert run_command(plasticity, [*LENGTH, "--seeds", "0"]) == sorted(f"{folder}/{name}/seed_0" for name in LINES)
-    table = (tmp_path / "out" / folder / "table.md").read_text()
-    assert "| return per episode | orthogonal alone | 0 | -10 | -20 |" in table and table in capsys.readouterr().out + "\n"
-    assert is_picture(tmp_path / "out" / folder / "plasticity.png")
-
-
-def test_what_the_variants_differ_in():
-    overrides = {name: variant_run(name, "Continual/Acrobot-v1", 0, 2, 800).overrides for name in LINES}
-    for name, (callbacks, *others) in overrides.items():
-        assert "'sb3_cchain.TaskSync'" in callbacks and callbacks.endswith("'sb3_cchain.analysis.NetworkHealth']")
-        assert others == ([f"churn_component:'{name}'"] if name in ("projection", "orthogonal") else [])
-
-
 def test_references(run_command, tmp_path, capsys):
     env_ids = ["Continual/Acrobot-v1", "Continual/CartPole-v1"]
     folders = [f"references_2x800/gym_control/Continual-{name}" for name in ("Acrobot-v1", "CartPole-v1")]
@@ -114,7 +98,7 @@ def test_a_failed_run_names_its_log_and_ends_the_command(run_command, tmp_path):
         (compare, ["--suite", "dmc", "--n-tasks", "9"], "`n_tasks` must be at most 3"),
         (compare, ["--suite", "gym_control", "--method", "nonsense"], "`method` must be one of oracle, .*; got nonsense"),
         (compare, ["--suite", "gym_control", "--env", "Continual/Maze-v0", *LENGTH], "`env_id` must be one of"),
-        (plasticity, ["--steps-per-task", "0"], "`steps_per_task` must be at least 1; got 0"),
+        (references, ["--steps-per-task", "0"], "`steps_per_task` must be at least 1; got 0"),
     ],
 )
 def test_errors_come_before_any_work(run_command, tmp_path, capsys, command, arguments, message):
@@ -130,7 +114,7 @@ def test_what_the_commands_do_not_need():
     code = (
         "import sys\n"
         "for name in ('ray', 'rliable', 'seaborn', 'markdown_it', 'optuna', 'rl_zoo3'): sys.modules[name] = None\n"
-        "import benchmarks.demo, benchmarks.compare, benchmarks.plasticity, benchmarks.run"
+        "import benchmarks.demo, benchmarks.compare, benchmarks.plasticity.__main__, benchmarks.run"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

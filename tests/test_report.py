@@ -799,17 +799,18 @@ def test_learning_curves(tmp_path, monkeypatch, suite, env_id, looks, n_axes):
 def test_a_picture_of_quantities_with_variants(tmp_path, monkeypatch):
     import matplotlib.pyplot as plt
 
-    from benchmarks.plasticity import LINES
+    from benchmarks.plasticity.runs import lines
 
+    compared = {name: lines("gym_control")[name] for name in ("vanilla", "cchain", "projection", "orthogonal")}
     metrics = [(steps, quantity.name, steps) for steps in (50, 150) for quantity in PLASTICITY[1:]]
-    for name, line in LINES.items():
+    for name, line in compared.items():
         write(tmp_path, line.name, [[0, 1], [0]], variant=name, metrics=metrics)
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
-    plot_quantities(whole_results(tmp_path), tmp_path / "a.png", LINES, PLASTICITY, "title", window=5)
+    plot_quantities(whole_results(tmp_path), tmp_path / "a.png", compared, PLASTICITY, "title", window=5)
     monkeypatch.undo()
     (figure,) = figures
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [line.label for line in LINES.values()]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [line.label for line in compared.values()]
     assert [axes.get_title() for axes in figure.axes] == [quantity.label for quantity in PLASTICITY]
     assert [axes.get_yscale() == "log" for axes in figure.axes] == [quantity.logarithmic for quantity in PLASTICITY]
     plt.close(figure)

@@ -129,19 +129,20 @@ def complete(
     return view.failures
 
 
-def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2) -> list[Result]:
+def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2, logs: Path | None = None) -> list[Result]:
     """
     Bring all runs of a command to their end on this machine, each tried once, and leave the process when runs failed or on
     Ctrl-C.
 
     :param runs: The runs
-    :param output: Folder of the results; the logs go to ``training`` in it
+    :param output: Folder of the results
     :param n_jobs: Runs at a time
+    :param logs: Folder of the logs, by default ``training`` in that of the results
     :return: Their results
     """
     try:
         with ended_by_sigterm(), LocalBackend(n_jobs) as backend:
-            failures = complete(runs, output, output / "training", backend, retries=0)
+            failures = complete(runs, output, logs or output / "training", backend, retries=0)
     except KeyboardInterrupt:
         sys.exit("Interrupted. The same command goes on.")
     if failures:

@@ -12,6 +12,9 @@ BUDGETS = ("paper", "reduced", "smoke")
 # Seeds of a budget; the paper's own stand in the suite's row
 N_SEEDS = {"reduced": 3, "smoke": 1}
 
+# Experiments whose runs tell nothing about the time of others: smoke runs are mostly start-up, and monitors take their time
+APART = ("smoke", "plasticity")
+
 # Where all methods of the registry are compared with each other, those of the paper and the others
 SHELF_SUITES = ("gym_control", "dmc")
 SHELF_ENVS = ("Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/Walker-v0")
@@ -123,7 +126,7 @@ def _check_names(option: str, given: Iterable[str] | None, allowed: Sequence[str
 class Rates:
     """
     How long a run will take: from the results in its environment with its method, else in its suite with its method, else
-    from the suite's row. Smoke runs, which are mostly start-up, are used for other smoke runs only.
+    from the suite's row. Those of ``APART`` are used for each other only.
 
     :param results: Results of any experiment
     """
@@ -137,8 +140,9 @@ class Rates:
 
     @staticmethod
     def _keys(run: Run) -> tuple[tuple, tuple]:
+        experiment = run.experiment.partition("_")[0]
         # Another strength takes no other time
-        kind = run.experiment == "smoke", run.line.partition("@")[0]
+        kind = experiment if experiment in APART else "", run.line.partition("@")[0]
         return (*kind, run.env_id), (*kind, run.suite)
 
     def seconds(self, run: Run) -> float:
