@@ -92,7 +92,7 @@ def shelf_table(scores: Scores, costs: Mapping[str, float], methods: Mapping[str
 
 def plot(scores: Scores, costs: Mapping[str, float], methods: Mapping[str, Method], path: Path) -> None:
     """
-    Draw a row for each method: its J(T) in each environment, a dot for each seed, and its cost.
+    Draw a row for each method: its J(T) in each environment that has runs, a dot for each seed, and its cost.
 
     :param scores: J(T)
     :param costs: Time of an iteration divided by PPO's, by label
@@ -100,9 +100,10 @@ def plot(scores: Scores, costs: Mapping[str, float], methods: Mapping[str, Metho
     :param path: PNG file
     """
     names = [name for name in order(scores, methods) if any(of_env.get(name) for of_env in scores.values())]
+    scores = {env_id: of_env for env_id, of_env in scores.items() if any(of_env.values())}
     matplotlib = import_matplotlib()
     figure = matplotlib.figure.Figure(figsize=(10, 1.2 + 0.27 * len(names)), layout="constrained")
-    panels = figure.subplots(1, len(scores) + 1, sharey=True, width_ratios=[*[3] * len(scores), 2])
+    panels = figure.subplots(1, len(scores) + 1, sharey=True, width_ratios=[*[3] * len(scores), 2.4])
     heights = np.arange(len(names))[::-1]
     for panel, (env_id, of_env) in zip(panels, scores.items(), strict=False):
         for height, name in zip(heights, names, strict=True):
@@ -116,7 +117,7 @@ def plot(scores: Scores, costs: Mapping[str, float], methods: Mapping[str, Metho
     shown = [costs.get(methods[name].label, np.nan) for name in names]
     panels[-1].barh(heights, shown, color=[methods[name].color for name in names], height=0.6)
     panels[-1].axvline(1, color="black", linestyle="--", linewidth=0.8)
-    panels[-1].set(title="time of an iteration", xlabel="time / PPO")
+    panels[-1].set(title="cost", xlabel="time of an iteration / PPO")
     panels[0].set_yticks(heights, [methods[name].label for name in names])
     for panel in panels:
         panel.spines[["top", "right"]].set_visible(False)
