@@ -35,7 +35,7 @@ def plot(problems: Mapping[str, Results], path: Path) -> None:
             marker = "." if n_tasks < 20 else None
             panel.plot(np.arange(1, n_tasks + 1), mean, color=COLORS[method], linewidth=1.6, marker=marker, label=label)
         panel.set(title=PROBLEMS[name].title, xlabel="task", ylabel="online accuracy")
-        panel.xaxis.get_major_locator().set_params(integer=True)
+        panel.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
         panel.spines[["top", "right"]].set_visible(False)
         if panel.lines:
             panel.legend(fontsize=8, frameon=False)
