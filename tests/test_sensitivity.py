@@ -10,7 +10,7 @@ from benchmarks.sensitivity.__main__ import COSTS, main
 from benchmarks.sensitivity.costs import Cost, measure, read_costs
 from benchmarks.sensitivity.picture import plot
 from benchmarks.sensitivity.runs import ENVS, PARAMETERS, all_runs, base_run, read_scores, sensitivity_run
-from benchmarks.sensitivity.tables import sensitivity_table
+from benchmarks.sensitivity.tables import cost_table, sensitivity_table
 from tests.fake_training import fake_program
 from tests.test_grid import make_result
 
@@ -129,7 +129,7 @@ def rows_of(table):
 
 
 def test_a_table_of_beta_by_hand(results):
-    table = sensitivity_table("beta", *scores_of("beta", results), [0, 1], {})
+    table = sensitivity_table("beta", *scores_of("beta", results), [0, 1])
     assert rows_of(table) == [
         ["β", "Acrobot-v1, by seed", "mean", "LunarLander-v3, by seed", "mean"],
         ["---"] * 5,
@@ -144,12 +144,20 @@ def test_a_table_of_beta_by_hand(results):
 
 
 def test_a_table_of_sizes_by_hand(results):
-    table = sensitivity_table("reference", *scores_of("reference", results), [0, 1], read_costs(results / COSTS))
-    rows = {row[0]: row[1:5] for row in rows_of(table)}
-    assert rows["PPO"] == ["-250.0 / -300.0", "-275.0", "1.00", "1.00 (1.00 to 1.00)"]
-    assert rows["0.25"] == ["-125.0 / –", "-125.0", "–", "–"]
+    table = sensitivity_table("reference", *scores_of("reference", results), [0, 1])
+    rows = {row[0]: row[1:3] for row in rows_of(table)}
+    assert rows["PPO"] == ["-250.0 / -300.0", "-275.0"]
+    assert rows["0.25"] == ["-125.0 / –", "-125.0"]
     assert rows["1 (shipped)"][0] == "-95.0 / -100.0"
-    assert rows["8"] == ["– / –", "–", "1.50", "1.20 (1.10 to 1.50)"]
+    assert rows["8"] == ["– / –", "–"]
+
+
+def test_a_table_of_costs_by_hand(results):
+    env_ids = list(scores_of("reference", results)[0])
+    rows = {row[0]: row[1:3] for row in rows_of(cost_table("reference", env_ids, read_costs(results / COSTS)))}
+    assert rows["PPO"] == ["1.00", "1.00 (1.00 to 1.00)"]
+    assert rows["0.25"] == ["–", "–"]
+    assert rows["8"] == ["1.50", "1.20 (1.10 to 1.50)"]
 
 
 def test_the_picture_shows_what_is_missing(results, tmp_path):
@@ -168,7 +176,7 @@ def test_the_picture_shows_what_is_missing(results, tmp_path):
 def test_the_page_comes_from_the_results_alone(results, tmp_path):
     (tmp_path / "docs").mkdir()
     page = tmp_path / "docs/sensitivity.md"
-    page.write_text("".join(f"<!-- table: sensitivity_{name} -->\n<!-- end -->\n" for name in PARAMETERS))
+    page.write_text("".join(f"<!-- table: sensitivity_{name} -->\n<!-- end -->\n" for name in [*PARAMETERS, "cost"]))
     command(tmp_path, "--write")
     assert page.read_text().count("| PPO | -250.0 / -300.0 |") == 2
     assert (tmp_path / "docs/images/sensitivity.png").exists()

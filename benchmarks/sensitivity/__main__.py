@@ -22,7 +22,7 @@ from benchmarks.run import list_grid
 from benchmarks.sensitivity.costs import measure, read_costs
 from benchmarks.sensitivity.picture import plot
 from benchmarks.sensitivity.runs import ENVS, PARAMETERS, all_runs, read_scores
-from benchmarks.sensitivity.tables import sensitivity_table
+from benchmarks.sensitivity.tables import cost_table, sensitivity_table
 from benchmarks.speed.tables import write_tables
 
 PICTURE = "images/sensitivity.png"
@@ -64,9 +64,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     costs = read_costs(args.results / COSTS)
     scores = {name: read_scores(name, args.seeds, args.budget, args.results) for name in PARAMETERS}
     tables = {
-        f"sensitivity_{name}": sensitivity_table(name, values, base, args.seeds, costs if name == "reference" else {})
-        for name, (values, base) in scores.items()
+        f"sensitivity_{name}": sensitivity_table(name, values, base, args.seeds) for name, (values, base) in scores.items()
     }
+    # β costs nothing
+    tables["sensitivity_cost"] = cost_table("reference", list(scores["reference"][0]), costs)
     print("\n\n".join(tables.values()))
     if args.write:
         n_tasks, steps = runs[0].n_tasks, f"{runs[0].steps_per_task:,}".replace(",", " ")
