@@ -9,7 +9,7 @@ import pytest
 from rich import get_console
 from rich.console import Console
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain import ContinualEnv, TaskSignal, TaskSync
@@ -137,6 +137,18 @@ def test_names():
     assert task_names(make_env()) == ["count one", "count two", "count three"]
     for env in ("Continual/CartPole-v1", "CartPole-v1"):  # tasks that differ in a number, and none
         assert task_names(make_vec_env(env)) == []
+
+
+def test_no_steps_at_all(bar, capsys):
+    make(make_env()).learn(0, callback=bar)
+    assert "100% ━" in capsys.readouterr().out
+
+
+def test_a_model_that_has_a_bar_can_be_saved(bar, tmp_path):
+    model = make(make_env())
+    model.bar = bar
+    model.learn(16, callback=[TaskSync(), bar, CheckpointCallback(8, str(tmp_path))])
+    assert PPO.load(tmp_path / "rl_model_8_steps").bar._live is None
 
 
 class Fail(BaseCallback):

@@ -47,6 +47,10 @@ class TaskProgressBar(BaseCallback):
         self._lock = threading.RLock()
         self._closed = threading.Event()
 
+    def __reduce__(self) -> tuple[type["TaskProgressBar"], tuple[()]]:
+        # A copy, such as in a saved model, is a new bar: what is in the terminal cannot be copied
+        return type(self), ()
+
     def state_dict(self) -> dict[str, Any]:
         """
         :return: Nothing: training that is resumed has a bar of its own
@@ -151,7 +155,7 @@ class TaskProgressBar(BaseCallback):
         bar.add_column(ratio=1)
         bar.add_column(no_wrap=True)
         bar.add_row(
-            f"{min(step / total, 1):4.0%}",
+            f"{min(step / total, 1) if total else 1:4.0%}",
             ProgressBar(total=total, completed=step),
             f"{step:,}/{total:,} {elapsed} < {left}, {'-' if speed is None else f'{speed:,.0f}'} steps/s",
         )
