@@ -175,6 +175,18 @@ def test_no_bar_is_left_after_an_error(bar, monkeypatch, error_in_update):
         time.sleep(0.05)
 
 
+def test_a_bar_that_an_error_left_gives_way_to_the_next_one_at_once(bar):
+    class Shown(BaseCallback):
+        def _on_step(self):
+            assert get_console()._live_stack == [bar._live]
+            return True
+
+    model = make(make_env())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(16, callback=[TaskProgressBar(), Fail()])
+    model.learn(16, callback=[bar, Shown()])
+
+
 def test_a_log_file_gets_the_end_alone(bar, capsys):
     make(make_env()).learn(48, callback=[TaskSync(), bar])
     first, second = capsys.readouterr().out.splitlines()
