@@ -1,5 +1,7 @@
 """Evaluation on all tasks during training."""
 
+import random
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
-from sb3_cchain.analysis import EvalAllTasks
+from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, task_evaluation
 from sb3_cchain.analysis.eval_all_tasks import read_task_returns
 from sb3_cchain.analysis.metrics.continual import return_matrix
 from sb3_cchain.envs import TaskVecNormalize
@@ -29,6 +31,13 @@ def tasks(**kwargs):
     rewards = (1.0, 2.0, 3.0)
     makers = [lambda reward=reward, **kw: CountEnv(int(reward), reward=reward, **kw) for reward in rewards]
     return ContinualEnv(makers, 32, **kwargs)
+
+
+PARTS, OTHER_PARTS = (spaces.Dict({name: spaces.Box(-1, 1, (2,), np.float32)}) for name in "ab")
+
+
+def random_tasks(observation_space):
+    return ContinualEnv([lambda: RandomEnv(observation_space)] * 3, 32)
 
 
 def evaluate(path, total=96, env=None, **kwargs):
@@ -239,11 +248,47 @@ def test_bad_arguments(kwargs, error, message):
         (tasks, CountEnv, TypeError, "`eval_env` must be a continual environment, got"),
         (tasks, lambda: ContinualEnv([CountEnv], 32), ValueError, "it has 1 tasks instead of 3"),
         (RandomEnv, tasks, TypeError, "EvalAllTasks is for continual environments"),
+        (tasks, lambda: VecNormalize(DummyVecEnv([tasks])), ValueError, "wrapped as .*: it alone has a VecNormalize"),
+        (lambda: VecNormalize(DummyVecEnv([tasks])), tasks, ValueError, "wrapped as .*: only that has a VecNormalize"),
+        (tasks, lambda: random_tasks(spaces.Box(-1e6, 1e6, (1,), np.float32)), ValueError, "must have the actions of the"),
+        (lambda: random_tasks(PARTS), lambda: random_tasks(OTHER_PARTS), ValueError, "must have the observations of the"),
     ],
 )
 def test_environments_that_do_not_fit(env, eval_env, error, message):
     with pytest.raises(error, match=message):
-        PPO("MlpPolicy", env(), **ARGUMENTS).learn(16, callback=EvalAllTasks(eval_env()))
+        training_env = env()
+        policy = "MultiInputPolicy" if isinstance(training_env.observation_space, spaces.Dict) else "MlpPolicy"
+        PPO(policy, training_env, **ARGUMENTS).learn(16, callback=EvalAllTasks(eval_env()))
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: DummyVecEnv([lambda: env])])
+def test_the_environment_of_training_is_refused(wrap):
+    env = wrap(tasks())
+    with pytest.raises(ValueError, match="`eval_env` must be another environment than that of training"):
+        PPO("MlpPolicy", env, **ARGUMENTS).learn(16, callback=EvalAllTasks(env))
+
+
+def test_a_warning_says_that_episodes_may_never_end(monkeypatch):
+    monkeypatch.setattr(task_evaluation, "LONG_EPISODE", 6)
+    model = PPO("MlpPolicy", tasks(), **ARGUMENTS)
+    with pytest.warns(UserWarning, match="EvalTrainedTask: an episode on task 0 goes on after 6 steps.*TimeLimit"):
+        model.learn(16, callback=[TaskSync(), EvalTrainedTask(tasks(), n_eval_episodes=1)])
+
+
+def test_pythons_random_numbers_are_left_as_they_are():
+    class Draws(CountEnv):
+        def reset(self, **kwargs):
+            self.length = random.randint(2, 5)
+            return super().reset(**kwargs)
+
+    def draws():
+        return ContinualEnv([Draws] * 2, 32)
+
+    states = []
+    for callbacks in ([], [EvalAllTasks(draws(), n_eval_episodes=1)]):
+        PPO("MlpPolicy", draws(), **ARGUMENTS).learn(48, callback=[TaskSync(), *callbacks])
+        states.append(random.getstate())
+    assert states[0] == states[1]
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path):

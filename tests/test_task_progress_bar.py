@@ -9,7 +9,7 @@ import pytest
 from rich import get_console
 from rich.console import Console
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cchain import ContinualEnv, TaskSignal, TaskSync
@@ -139,6 +139,18 @@ def test_names():
         assert task_names(make_vec_env(env)) == []
 
 
+def test_no_steps_at_all(bar, capsys):
+    make(make_env()).learn(0, callback=bar)
+    assert "100% ━" in capsys.readouterr().out
+
+
+def test_a_model_that_has_a_bar_can_be_saved(bar, tmp_path):
+    model = make(make_env())
+    model.bar = bar
+    model.learn(16, callback=[TaskSync(), bar, CheckpointCallback(8, str(tmp_path))])
+    assert PPO.load(tmp_path / "rl_model_8_steps").bar._live is None
+
+
 class Fail(BaseCallback):
     """An error in the first rollout."""
 
@@ -161,6 +173,18 @@ def test_no_bar_is_left_after_an_error(bar, monkeypatch, error_in_update):
     while bar._live is not None or console._live_stack or sys.stdout is not stdout:
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_a_bar_that_an_error_left_gives_way_to_the_next_one_at_once(bar):
+    class Shown(BaseCallback):
+        def _on_step(self):
+            assert get_console()._live_stack == [bar._live]
+            return True
+
+    model = make(make_env())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(16, callback=[TaskProgressBar(), Fail()])
+    model.learn(16, callback=[bar, Shown()])
 
 
 def test_a_log_file_gets_the_end_alone(bar, capsys):

@@ -49,7 +49,8 @@ class EvalAllTasks(TaskEvaluation):
     :param path: The CSV file; by default ``task_returns.csv`` in the folder of the logs, if there is one (see
         :class:`~sb3_cchain.ContinualMetrics`)
     :raises ValueError: Naming the argument that is out of its range. When training starts: for an evaluation environment that
-        has other tasks or spaces, or cannot be made; for a second EvalAllTasks; for a file that is not one of task returns
+        has other tasks, spaces or normalisation, is that of training, or cannot be made; for a second EvalAllTasks; for a file
+        that is not one of task returns
     :raises TypeError: When ``path`` is not a path or ``deterministic`` not a boolean. When training starts, for an environment
         that is not continual
     """

@@ -1,5 +1,6 @@
 """Evaluates on tasks of a continual environment during training."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -32,6 +34,9 @@ from sb3_cchain.tasks.signal import (
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number
+
+# Steps of an episode after which a warning says that it may never end
+LONG_EPISODE = 100_000
 
 
 class TaskEvaluation(BaseCallback):
@@ -76,15 +81,10 @@ class TaskEvaluation(BaseCallback):
         require_continual(self)
         env = _make_eval_env(self.model) if self.eval_env is None else self.eval_env
         self.eval_env = self.model._wrap_env(env, verbose=0)
+        _check_fits(self.eval_env, self.training_env)
         normalize = unwrap_vec_normalize(self.eval_env)
         if normalize is not None:
             normalize.training = False  # its statistics are those of training
-        expected, given = self.training_env.observation_space, self.eval_env.observation_space
-        if given.shape != expected.shape:
-            raise ValueError(
-                f"`eval_env` must have the observations of the training environment, {expected}, got {given}. Wrap it as the "
-                "training environment"
-            )
         if not is_continual(self.eval_env):
             raise TypeError(f"`eval_env` must be a continual environment, got {self.eval_env.unwrapped}")
         check_same_tasks(self.training_env, self.eval_env)
@@ -167,9 +167,49 @@ class TaskEvaluation(BaseCallback):
         def collect(step: Mapping[str, Any], _: Any) -> None:
             if step["done"]:
                 returns.append(step["info"]["episode_return"])
+            elif step["current_lengths"][step["i"]] == LONG_EPISODE:
+                warnings.warn(
+                    f"{type(self).__name__}: an episode on task {task} goes on after {LONG_EPISODE} steps. If episodes do not "
+                    "end by themselves, give an `eval_env` with a TimeLimit."
+                )
 
         evaluate_policy(self.model, self.eval_env, self.n_eval_episodes, self.deterministic, callback=collect, warn=False)
         return float(np.mean(returns))
+
+
+def _check_fits(eval_env: VecEnv, training_env: VecEnv) -> None:
+    """Whether a model that is trained in one environment can be evaluated in the other, without touching the training."""
+    if any(env is trained for env in _single_envs(eval_env) for trained in _single_envs(training_env)):
+        raise ValueError("`eval_env` must be another environment than that of training, got the same: make a second one")
+    for kind, plural in (("observation_space", "observations"), ("action_space", "actions")):
+        expected, given = getattr(training_env, kind), getattr(eval_env, kind)
+        if _measures(given) != _measures(expected):
+            raise ValueError(
+                f"`eval_env` must have the {plural} of the training environment, {expected}, got {given}. Wrap it as the "
+                "training environment"
+            )
+    expected, given = (_normalises(env) for env in (training_env, eval_env))
+    if given != expected:
+        raise ValueError(
+            f"`eval_env` must be wrapped as the training environment: {'only that' if expected else 'it alone'} has a "
+            "VecNormalize of observations"
+        )
+
+
+def _single_envs(env: VecEnv) -> list[Any]:
+    return [single.unwrapped for single in getattr(env.unwrapped, "envs", [env])]
+
+
+def _measures(space: gym.Space) -> Any:
+    """What two spaces must have in common: shapes, and the numbers of discrete choices. Limits may differ."""
+    if isinstance(space, spaces.Dict):
+        return {key: _measures(part) for key, part in space.items()}
+    return type(space), space.shape, np.asarray(getattr(space, "nvec", getattr(space, "n", 0))).tolist()
+
+
+def _normalises(env: VecEnv) -> bool:
+    normalize = unwrap_vec_normalize(env)
+    return normalize is not None and normalize.norm_obs
 
 
 def _make_eval_env(model: BaseAlgorithm) -> VecEnv:

@@ -21,6 +21,9 @@ from sb3_cchain.tasks.signal import TaskSwitch, active_signal, is_continual, tol
 
 SECONDS_BETWEEN_DRAWINGS = 0.25
 
+# The bars in the terminal, with the learn() that each of them belongs to
+_open_bars: dict["TaskProgressBar", LearnCall] = {}
+
 
 class TaskProgressBar(BaseCallback):
     """
@@ -46,6 +49,10 @@ class TaskProgressBar(BaseCallback):
         self._live: Live | None = None
         self._lock = threading.RLock()
         self._closed = threading.Event()
+
+    def __reduce__(self) -> tuple[type["TaskProgressBar"], tuple[()]]:
+        # A copy, such as in a saved model, is a new bar: what is in the terminal cannot be copied
+        return type(self), ()
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -77,10 +84,15 @@ class TaskProgressBar(BaseCallback):
         self._open()
 
     def _open(self) -> None:
+        # One that an error has just left: rich does not show a bar that is opened before another one is closed
+        for bar, call in list(_open_bars.items()):
+            if call.is_over():
+                bar.close()
+        _open_bars[self] = LearnCall()
         self._closed = threading.Event()
         self._live = Live(get_renderable=self.render, auto_refresh=False)
         self._live.start()
-        threading.Thread(target=self._draw, args=(self._closed, LearnCall()), daemon=True).start()
+        threading.Thread(target=self._draw, args=(self._closed, _open_bars[self]), daemon=True).start()
         atexit.register(self.close)
 
     def _draw(self, closed: threading.Event, call: LearnCall) -> None:
@@ -100,6 +112,7 @@ class TaskProgressBar(BaseCallback):
                 live.stop()
                 if not live.console.is_terminal:
                     live.console.line()
+        _open_bars.pop(self, None)
         atexit.unregister(self.close)
 
     def _on_rollout_start(self) -> None:
@@ -151,7 +164,7 @@ class TaskProgressBar(BaseCallback):
         bar.add_column(ratio=1)
         bar.add_column(no_wrap=True)
         bar.add_row(
-            f"{min(step / total, 1):4.0%}",
+            f"{min(step / total, 1) if total else 1:4.0%}",
             ProgressBar(total=total, completed=step),
             f"{step:,}/{total:,} {elapsed} < {left}, {'-' if speed is None else f'{speed:,.0f}'} steps/s",
         )
