@@ -80,12 +80,6 @@ def minatar_game():
     return gym.make("MinAtar/Breakout-v1")
 
 
-def dm_control():
-    if "dm_control" in NO_WHEELS:
-        pytest.skip("no wheels")
-    return gym.make("dm_control/cartpole-balance-v0")
-
-
 WRAPPED = {
     "ObservationOffset": (lambda: ObservationOffset(cart_pole(), np.float32([0.1, 1, 2, 3])), {"offset"}),
     "RewardScale": (lambda: RewardScale(cart_pole(), 0.05), {"scale"}),
@@ -95,11 +89,11 @@ WRAPPED = {
     "ChannelPadding": (lambda: ChannelPadding(minatar_game(), 10), {"n_channels"}),
     "SeededStickyAction": (lambda: SeededStickyAction(minatar_game()), set()),
     "PixelFrames": (lambda: PixelFrames(minatar_game(), 3), {"scale"}),
-    "FlatDMControl": (lambda: FlatDMControl(dm_control()), set()),
+    "FlatDMControl": (lambda: FlatDMControl(gym.make("dm_control/cartpole-balance-v0")), set()),
 }
 
 
-@pytest.mark.parametrize("name", WRAPPED)
+@pytest.mark.parametrize("name", [name for name in WRAPPED if name != "FlatDMControl" or "dm_control" not in NO_WHEELS])
 def test_the_spec_of_a_wrapped_environment_makes_it_again(name):
     wrap, arguments = WRAPPED[name]
     env = wrap()
