@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.plan import SHELF_SUITES, shelf_runs
 from benchmarks.grid.results import Result, find_result
-from benchmarks.grid.run import ROOT, Run, short_name, suite_methods
+from benchmarks.grid.run import Run, short_name, suite_methods
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.task_tables import MISSING
 from benchmarks.speed.tables import PLACE, write_tables
@@ -133,8 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     :param arguments: Arguments of the command line
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of all results")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser)
     parser.add_argument("--write", action="store_true", help="Put table and picture into the documentation")
     args = parser.parse_args(arguments)
     runs = shelf_runs()

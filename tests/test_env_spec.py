@@ -80,6 +80,13 @@ def minatar_game():
     return gym.make("MinAtar/Breakout-v1")
 
 
+def dm_control():
+    import shimmy
+
+    gym.register_envs(shimmy)
+    return gym.make("dm_control/cartpole-balance-v0")
+
+
 WRAPPED = {
     "ObservationOffset": (lambda: ObservationOffset(cart_pole(), np.float32([0.1, 1, 2, 3])), {"offset"}),
     "RewardScale": (lambda: RewardScale(cart_pole(), 0.05), {"scale"}),
@@ -89,7 +96,7 @@ WRAPPED = {
     "ChannelPadding": (lambda: ChannelPadding(minatar_game(), 10), {"n_channels"}),
     "SeededStickyAction": (lambda: SeededStickyAction(minatar_game()), set()),
     "PixelFrames": (lambda: PixelFrames(minatar_game(), 3), {"scale"}),
-    "FlatDMControl": (lambda: FlatDMControl(gym.make("dm_control/cartpole-balance-v0")), set()),
+    "FlatDMControl": (lambda: FlatDMControl(dm_control()), set()),
 }
 
 

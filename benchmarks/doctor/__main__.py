@@ -17,6 +17,7 @@ import torch as th
 from benchmarks.doctor.cases import CASES
 from benchmarks.doctor.results import confusion_table, examine, models_table, read, write, wrong_table
 from benchmarks.doctor.training import patients, train_missing
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.run import ROOT
 from benchmarks.speed.tables import write_tables
 from sb3_cchain.analysis.findings import findings_markdown
@@ -33,8 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--again", action="store_true", help="Inspect all models again")
     parser.add_argument("--write", action="store_true", help="Put the tables into the documentation")
     parser.add_argument("--models", type=Path, default=ROOT / "logs/doctor", help="Folder of the models")
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results/doctor", help="Folder of the results")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser, "benchmarks/results/doctor")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     warnings.simplefilter("ignore")  # sick models give many

@@ -10,14 +10,13 @@ them as they go, and makes tables and pictures. Runs that are done are not made 
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from benchmarks.family.cases import CASES
 from benchmarks.family.picture import plot
 from benchmarks.family.tables import about, case_table, falls_table, read_all, summary_table
 from benchmarks.family.training import runs_of, train_all
-from benchmarks.grid.run import ROOT
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.speed.tables import write_tables
 
 
@@ -33,9 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, help="Some of the cases' seeds, by default all")
     parser.add_argument("--jobs", type=int, default=1, help="Runs at a time")
     parser.add_argument("--write", action="store_true", help="Put tables and pictures into the documentation")
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results/family", help="Folder of the results")
-    parser.add_argument("--logs", type=Path, default=ROOT / "logs/family", help="Folder of the checkpoints")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser, "benchmarks/results/family", "logs/family")
     args = parser.parse_args(arguments)
     all_runs = {name: runs_of(name, args.results, args.logs) for name in CASES}
     chosen = [run for name in args.case or () for run in all_runs[name]]

@@ -1,8 +1,10 @@
-"""Arguments that the commands which compare variants of a method have in common."""
+"""Arguments that several commands have in common."""
 
 import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+from benchmarks.grid.run import ROOT
 
 
 def add_variant_arguments(
@@ -22,3 +24,17 @@ def add_variant_arguments(
     parser.add_argument("--steps-per-task", type=int, default=steps_per_task, help="Environment steps per task")
     parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
     parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
+
+
+def add_folder_arguments(
+    parser: argparse.ArgumentParser, results: str = "benchmarks/results", logs: str | None = None
+) -> None:
+    """
+    :param parser: The parser of a command whose tables and pictures are part of the documentation
+    :param results: Default folder of the results, below the repository
+    :param logs: Default folder of the logs, below the repository; None for a command that trains nothing
+    """
+    parser.add_argument("--results", type=Path, default=ROOT / results, help="Folder of the results")
+    if logs is not None:
+        parser.add_argument("--logs", type=Path, default=ROOT / logs, help="Folder of logs and checkpoints")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")

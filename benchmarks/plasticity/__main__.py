@@ -11,14 +11,14 @@ The same command goes on where it was interrupted.
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS, run_length
 from benchmarks.grid.results import find_result
-from benchmarks.grid.run import ROOT, Run
+from benchmarks.grid.run import Run
 from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.page import read_groups, section, table
 from benchmarks.plasticity.runs import COMPONENTS, default_names, watched_run
@@ -51,9 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--write", action="store_true", help="Put all tables and pictures into the documentation, train nothing"
     )
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of the results")
-    parser.add_argument("--logs", type=Path, default=ROOT / "logs/plasticity", help="Folder of the logs")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser, logs="logs/plasticity")
     args = parser.parse_args(arguments)
 
     if args.write:

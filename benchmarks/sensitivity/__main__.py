@@ -11,13 +11,12 @@ are done are not made again, others go on where they were. PPO and C-CHAIN with 
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS
-from benchmarks.grid.run import ROOT
 from benchmarks.run import list_grid
 from benchmarks.sensitivity.costs import measure, read_costs
 from benchmarks.sensitivity.picture import plot
@@ -45,9 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--dry-run", action="store_true", help="List the runs and what they will cost, and train nothing")
     parser.add_argument("--time", action="store_true", help="Measure what an iteration costs, and train nothing")
     parser.add_argument("--write", action="store_true", help="Put tables and picture into the documentation, train nothing")
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of the results")
-    parser.add_argument("--logs", type=Path, default=ROOT / "logs/grid", help="Folder of the logs")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser, logs="logs/grid")
     args = parser.parse_args(arguments)
     try:
         runs = all_runs(args.parameter, args.value, args.env, args.seeds, args.budget)

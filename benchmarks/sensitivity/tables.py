@@ -1,6 +1,6 @@
 """J(T) and cost as tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from textwrap import fill
 
 import numpy as np
@@ -21,21 +21,15 @@ def sensitivity_table(name: str, values: Scores, base: Scores, seeds: Sequence[i
     :param seeds: Seeds that are to be run
     :return: PPO and each value: J(T) of each seed, and their mean; below, how many runs are missing
     """
-    parameter = PARAMETERS[name]
-    header = [parameter.label]
-    for env_id in values:
-        header += [f"{short_name(env_id)}, by seed", "mean"]
-    rows = []
-    for value in (BASE, *parameter.values):
-        row = [_row_name(name, value, list(values))]
-        for env_id in values:
-            scores = (base if value == BASE else values)[env_id][value]
-            row += [" / ".join(f"{scores[seed]:.1f}" if seed in scores else MISSING for seed in seeds), _mean(scores)]
-        rows.append(row)
-    cells = [scores for table in (values, base) for of_env in table.values() for scores in of_env.values()]
-    n_runs, n_done = len(cells) * len(seeds), sum(map(len, cells))
+
+    def cells(env_id: str, value: str) -> list[str]:
+        scores = (base if value == BASE else values)[env_id][value]
+        return [" / ".join(f"{scores[seed]:.1f}" if seed in scores else MISSING for seed in seeds), _mean(scores)]
+
+    all_scores = [scores for table in (values, base) for of_env in table.values() for scores in of_env.values()]
+    n_runs, n_done = len(all_scores) * len(seeds), sum(map(len, all_scores))
     words = f"Seeds {', '.join(map(str, seeds))}; {n_done} of {n_runs} runs are done. The others are missing ({MISSING})."
-    return f"{markdown_table(header, rows)}\n\n{fill(words, LINE_LENGTH)}"
+    return f"{_table(name, list(values), ('by seed', 'mean'), cells)}\n\n{fill(words, LINE_LENGTH)}"
 
 
 def cost_table(name: str, env_ids: Sequence[str], costs: Mapping[str, Mapping[str, Cost]]) -> str:
@@ -45,16 +39,25 @@ def cost_table(name: str, env_ids: Sequence[str], costs: Mapping[str, Mapping[st
     :param costs: Processor time, by environment and model
     :return: PPO and each value: seconds of 1000 steps, and these divided by PPO's
     """
-    parameter = PARAMETERS[name]
-    header = [parameter.label]
+
+    def cells(env_id: str, value: str) -> list[str]:
+        cost = costs.get(env_id, {}).get(value)
+        if cost is None:
+            return [MISSING, MISSING]
+        median, least, greatest = cost.ratios
+        return [f"{cost.seconds:.2f}", f"{median:.2f} ({least:.2f} to {greatest:.2f})"]
+
+    return _table(name, env_ids, ("s / 1000 steps", "time / PPO"), cells)
+
+
+def _table(name: str, env_ids: Sequence[str], columns: tuple[str, str], cells: Callable[[str, str], list[str]]) -> str:
+    """A row for PPO and for each value; two columns for each environment, the first of which names it."""
+    header = [PARAMETERS[name].label]
     for env_id in env_ids:
-        header += [f"{short_name(env_id)}, s / 1000 steps", "time / PPO"]
+        header += [f"{short_name(env_id)}, {columns[0]}", columns[1]]
     rows = []
-    for value in (BASE, *parameter.values):
-        row = [_row_name(name, value, env_ids)]
-        for env_id in env_ids:
-            row += _cost_cells(costs.get(env_id, {}).get(value))
-        rows.append(row)
+    for value in (BASE, *PARAMETERS[name].values):
+        rows.append([_row_name(name, value, env_ids), *(cell for env_id in env_ids for cell in cells(env_id, value))])
     return markdown_table(header, rows)
 
 
@@ -66,10 +69,3 @@ def _row_name(name: str, value: str, env_ids: Sequence[str]) -> str:
 
 def _mean(scores: Mapping[int, float]) -> str:
     return f"{np.mean(list(scores.values())):.1f}" if scores else MISSING
-
-
-def _cost_cells(cost: Cost | None) -> list[str]:
-    if cost is None:
-        return [MISSING, MISSING]
-    median, least, greatest = cost.ratios
-    return [f"{cost.seconds:.2f}", f"{median:.2f} ({least:.2f} to {greatest:.2f})"]
