@@ -562,6 +562,27 @@ def test_report_of_a_method_alone(tmp_path, no_drawing):
     assert "Over the environments" not in text and "Neural" not in text
 
 
+def test_each_picture_has_few_curves(tmp_path, no_drawing, monkeypatch):
+    others = ["layer_norm", "redo", "adam_rel", "parseval", "fire", "muon", "simba"]  # in the order of the tables
+    for method in ("vanilla", "cchain", *others):
+        write(tmp_path, method, [[-90], [-90]])
+    drawn = []
+    monkeypatch.setattr(
+        "benchmarks.report.document.plot_learning_curves",
+        lambda runs, path, lines: (drawn.append((path.name, [run.method for run in runs])), path.write_bytes(b"png")),
+    )
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    name = "curves_Continual-Acrobot-v1"
+    assert [picture for picture, _ in drawn] == [f"{name}.png", f"{name}_2.png", f"{name}_3.png"]
+    assert [set(methods) for _, methods in drawn] == [
+        {"vanilla", "cchain"},
+        {"vanilla", *others[:5]},
+        {"vanilla", *others[5:]},
+    ]
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert all(f"(pictures/{picture})" in text for picture, _ in drawn)
+
+
 @pytest.mark.parametrize("lines", [("cchain", "cchain@1e3", "cchain@1e4"), ("cchain@1e4",)])
 def test_another_beta_has_columns_of_its_own(tmp_path, lines):
     for seed in (0, 1):

@@ -10,6 +10,7 @@ from benchmarks.grid.run import (
     as_json,
     lines_in_order,
     other_strength,
+    paper_methods,
     shipped_hyperparameters,
     short_name,
     suite_lines,
@@ -41,6 +42,9 @@ from benchmarks.report.tables import (
 )
 from benchmarks.report.task_tables import MISSING, quantities_table, returns_header, returns_rows, seeds_text
 from benchmarks.report.verdicts import verdict_words
+
+# Methods in a picture beside the base algorithm, where the paper does not compare them: more curves cannot be told apart
+METHODS_BESIDE = 5
 
 INTRODUCTION = """# The paper's tables, reproduced: budget {budget}
 
@@ -266,14 +270,28 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, picture
     parts = [
         "### Learning curves",
         f"The mean{smooth} over all seeds of each method, with a band of ± one standard error; a single seed has no band. "
+        "The methods that the paper compares come first, then the others, a few at a time beside the base algorithm. "
         "Dashed: the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
     ]
     for env_id, runs in _by_env(results, paper).items():
-        path, picture = pictures.add(f"curves_{env_id.replace('/', '-')}", f"Learning curves in {short_name(env_id)}")
-        plot_learning_curves(runs, path, lines)
-        table = markdown_table(returns_header(runs[0].task_names), returns_rows(runs, lines, table_digits(paper)))
-        parts += [f"{short_name(env_id)}:", picture, table]
+        parts.append(f"{short_name(env_id)}:")
+        for number, shown in enumerate(_distinguishable(runs), start=1):
+            name = f"curves_{env_id.replace('/', '-')}" + (f"_{number}" if number > 1 else "")
+            path, picture = pictures.add(name, f"Learning curves in {short_name(env_id)}")
+            plot_learning_curves(shown, path, lines)
+            parts.append(picture)
+        parts.append(markdown_table(returns_header(runs[0].task_names), returns_rows(runs, lines, table_digits(paper))))
     return parts
+
+
+def _distinguishable(results: Sequence[Result]) -> list[list[Result]]:
+    """The runs of each picture: of the paper's methods, then of the others, a few at a time beside the base algorithm."""
+    suite = results[0].suite
+    compared = set(paper_methods(suite))
+    others = [name for name in suite_methods(suite) if name not in compared and any(run.method == name for run in results)]
+    groups = [compared]
+    groups += [{"vanilla", *others[start : start + METHODS_BESIDE]} for start in range(0, len(others), METHODS_BESIDE)]
+    return [shown for group in groups if (shown := [result for result in results if result.method in group])]
 
 
 def _continual_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:
