@@ -25,6 +25,9 @@ class Kron(OptimizerWrapper):
     `pytorch-optimizer <https://github.com/kozistr/pytorch_optimizer>`_ (extra ``psgd``), as an optimiser of this package: it
     has no optimiser inside, and can be the ``base_class`` of the others. It has no step count, which :class:`AdamRel` needs.
 
+    Its factors grow for as long as the gradients are 0, such as those of a policy that has collapsed, until the parameters are
+    NaN.
+
     It costs a few products of each matrix with square matrices of its sides, and as long as the preconditioner is learned in
     each update, two triangular solves and more products. The factors take as much memory as two square matrices per
     matrix.
