@@ -1,6 +1,6 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
@@ -122,18 +122,20 @@ class ChurnAlgorithm(ZeroRateWarning):
         with reduced_churn(self, self.churn_reducers, self._churn_options()):
             super().train(*args, **kwargs)  # type: ignore[misc]
 
-    def learn(self: SelfChurnAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfChurnAlgorithm:
-        """
-        As the base algorithm's. In a continual environment the callbacks that follow its tasks are added.
+    if not TYPE_CHECKING:  # type checkers know the arguments of the base algorithm's own
 
-        :param total_timesteps: Environment steps to train for
-        :param args: As of the base algorithm
-        :param kwargs: As of the base algorithm. The run in TensorBoard is by default named after the class.
-        :return: The trained model
-        """
-        if len(args) < 3:
-            kwargs.setdefault("tb_log_name", type(self).__name__)
-        return super().learn(total_timesteps, *args, **kwargs)  # type: ignore[safe-super]
+        def learn(self: SelfChurnAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfChurnAlgorithm:
+            """
+            As the base algorithm's. In a continual environment the callbacks that follow its tasks are added.
+
+            :param total_timesteps: Environment steps to train for
+            :param args: As of the base algorithm
+            :param kwargs: As of the base algorithm. The run in TensorBoard is by default named after the class.
+            :return: The trained model
+            """
+            if len(args) < 3:
+                kwargs.setdefault("tb_log_name", type(self).__name__)
+            return super().learn(total_timesteps, *args, **kwargs)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
@@ -151,7 +153,7 @@ class ChurnAlgorithm(ZeroRateWarning):
                 reducer.coefficient.reset()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        vars(self).update(state)
         if "churn_reducers" in state:
             # A copy, by pickle or deepcopy: `churn_state` became a dict of that moment, and has to follow the copy's training
             keep_churn_state(self, self.churn_reducers, self._task_switch)
