@@ -53,5 +53,7 @@ class _Carrying(th.autograd.Function):
         return tensor.view_as(tensor)
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor, None]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  # as in torch's documentation
+        ctx: Any, gradient: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, None]:
         return gradient, ctx.coef, None

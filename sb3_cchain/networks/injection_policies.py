@@ -44,8 +44,8 @@ class Injectable(nn.Module):
         self.is_injected.fill_(True)
         self._freeze()
 
-    def _load_from_state_dict(self, *args: Any) -> None:
-        super()._load_from_state_dict(*args)
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
         self._freeze()
 
 

@@ -39,14 +39,14 @@ class SpectralNormLinear(nn.Linear):
             # In place, because SB3 keeps the tensor
             self.running_u.copy_(F.normalize(self.weight @ (self.weight.T @ self.running_u), dim=0))
 
-    def forward(self, inputs: th.Tensor) -> th.Tensor:
+    def forward(self, input: th.Tensor) -> th.Tensor:
         """
-        :param inputs: ``(batch_size, in_features)``
+        :param input: ``(batch_size, in_features)``
         :return: ``(batch_size, out_features)``
         """
         # A copy, which the gradient needs as it is now
         sigma = (self.weight.T @ self.running_u.clone()).norm().clamp(min=1e-12)
-        outputs = F.linear(inputs, self.weight / sigma, self.bias)
+        outputs = F.linear(input, self.weight / sigma, self.bias)
         if self.training:
             self.iterate()
         return outputs
