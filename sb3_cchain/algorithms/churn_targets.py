@@ -299,12 +299,13 @@ class ChurnArguments:
 
 
 def _say_when_there_is_no_other_data(model: Any) -> None:
-    if model.verbose >= 1 and isinstance(model, OnPolicyAlgorithm) and hasattr(model, "batch_size"):  # A2C has none
+    batch_size = getattr(model, "batch_size", None)  # A2C has none
+    if model.verbose >= 1 and isinstance(model, OnPolicyAlgorithm) and batch_size is not None:
         n_samples = model.n_steps * model.n_envs
-        if n_samples <= model.batch_size:
+        if n_samples <= batch_size:
             print(
                 f"A rollout of n_steps * n_envs = {n_samples} steps is a single minibatch of "
-                f"batch_size={model.batch_size}: there is no data outside it to measure churn on, so the minibatch is its own "
+                f"batch_size={batch_size}: there is no data outside it to measure churn on, so the minibatch is its own "
                 "reference batch. Choose a `batch_size` of at most half a rollout."
             )
 

@@ -61,8 +61,9 @@ def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:
     if isinstance(model.action_space, spaces.Discrete):
         actions = actions.long().flatten(start_dim=1)
     minibatches: tuple[Any, ...] = (minibatches_of(buffer.observations), actions, advantages)
-    if hasattr(buffer, "action_masks"):  # of sb3-contrib's MaskablePPO
-        minibatches += (minibatches_of(buffer.action_masks.reshape(*buffer.advantages.shape, -1)),)
+    masks = getattr(buffer, "action_masks", None)  # of sb3-contrib's MaskablePPO
+    if masks is not None:
+        minibatches += (minibatches_of(masks.reshape(*buffer.advantages.shape, -1)),)
 
     def objective(minibatch: tuple[Any, ...]) -> th.Tensor:
         observations, actions, advantages, *masks = minibatch

@@ -106,8 +106,9 @@ def _relative_entropy(space: spaces.Space, probabilities: th.Tensor) -> th.Tenso
 def _exploration(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -> th.Tensor | None:
     if outputs.probabilities is not None:
         return _relative_entropy(model.action_space, outputs.probabilities).mean()
-    if hasattr(model, "exploration_rate"):
-        return th.tensor(float(model.exploration_rate))
+    exploration_rate = getattr(model, "exploration_rate", None)
+    if exploration_rate is not None:
+        return th.tensor(float(exploration_rate))
     if outputs.action_means is None or not isinstance(model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
         return None
     std = action_std(model, batch)

@@ -162,8 +162,9 @@ def has_other_env(model: BaseAlgorithm) -> bool:
 def _single_env(model: BaseAlgorithm) -> Any:
     assert model.env is not None
     env = model.env.unwrapped
+    envs = getattr(env, "envs", None)
     # set_env() wraps the same environment again
-    return env.envs[0].unwrapped if hasattr(env, "envs") else env
+    return env if envs is None else envs[0].unwrapped
 
 
 def task_switched(model: BaseAlgorithm) -> None:
