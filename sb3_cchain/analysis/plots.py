@@ -52,7 +52,7 @@ def draw_ntk(axes: Axes, matrix: th.Tensor, title: str) -> AxesImage:
     :param title: Title
     :return: The image
     """
-    limit = np.quantile(matrix.abs().cpu().numpy(), 0.99)
+    limit = float(np.quantile(matrix.abs().cpu().numpy(), 0.99))
     axes.set(title=title, xlabel="minibatch", ylabel="minibatch")
     return axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
 
@@ -85,7 +85,7 @@ def plot_models(
                 else:
                     part.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
         height = 0.8 / len(names)
-        all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False).flat
+        all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False)[0]
         for axes, (title, values) in zip(all_axes, bars.items(), strict=True):
             for i, (name, lengths) in enumerate(zip(names, values, strict=True)):
                 axes.barh(np.arange(len(groups)) + i * height, lengths, height, label=name)
@@ -95,7 +95,7 @@ def plot_models(
             axes.margins(x=0.1)
             axes.set_xlim(left=0)
             axes.locator_params(axis="x", nbins=4)
-        axes.invert_yaxis()
+        all_axes[0].invert_yaxis()
         if len(names) > 1:
-            below.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+            below.legend(*all_axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
