@@ -116,10 +116,9 @@ def _data_state(data: Any) -> dict[str, Any] | None:
 
 
 def _restore_data(data: Any, state: dict[str, Any] | None) -> None:
-    import mujoco
-
     if state is None:
         return
+    mujoco = sys.modules["mujoco"]
     content = state["head"]
     if state["tail"] is not None:
         content = b"".join([content, data.model.__getstate__(), zlib.decompress(state["tail"])])
@@ -130,9 +129,7 @@ def _restore_data(data: Any, state: dict[str, Any] | None) -> None:
 
 def _size(model: Any) -> int:
     """Bytes of a model as MuJoCo writes it: a flag, the size twice, and the model."""
-    import mujoco
-
-    return 1 + 8 + 8 + mujoco.mj_sizeModel(model)
+    return 1 + 8 + 8 + sys.modules["mujoco"].mj_sizeModel(model)
 
 
 def _begin(size: int) -> bytes:
