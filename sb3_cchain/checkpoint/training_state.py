@@ -187,17 +187,18 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
     :param store: The big arrays
     """
     model, known = parts.model, parts.known
-    envs = {} if state["envs"] is None else parts.env_parts()
+    saved_envs = state["envs"] or {}
+    envs = parts.env_parts() if saved_envs else {}
     holders: dict[str, object] = {"model": model, **parts.callbacks}
     for name, env in envs.items():
         saved_layers = [layer for layer in state["objects"].holders if layer.startswith(f"{name} ")]
-        check_same_environment(parts.envs[name], env.holders, state["envs"][name][0], saved_layers)
+        check_same_environment(parts.envs[name], env.holders, saved_envs[name][0], saved_layers)
         holders.update(env.holders)
         known.update(env.known)
     _restore_parameters(model, model_path)
     restore_objects(holders, state["objects"], known)
     for name in envs:
-        restore_remotes(parts.envs[name], state["envs"][name][1])
+        restore_remotes(parts.envs[name], saved_envs[name][1])
     for noise, saved in zip(_gsde(model), state["gsde_noise"], strict=True):
         vars(noise).update(saved)
     if state["replay_buffer"] is not None:
