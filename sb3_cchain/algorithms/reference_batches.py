@@ -30,6 +30,7 @@ class RolloutReferences(Protocol):
         :param batch_size: Minibatch size
         :return: The minibatches of one epoch
         """
+        ...
 
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> Any:
         """

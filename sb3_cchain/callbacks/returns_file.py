@@ -9,7 +9,7 @@ from typing import TextIO
 from sb3_cchain.locked_file import open_locked
 
 RETURNS_CSV = "returns.csv"
-COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
+COLUMNS: tuple[str, ...] = ("timesteps", "task_id", "n_episodes", "mean_return")
 
 
 class ReturnsFile:

@@ -176,7 +176,7 @@ def _replace(old: Any, new: Any) -> None:
     old.update(new)
 
 
-def _make(kind: type) -> Any:
+def _make(kind: Any) -> Any:
     """An object without content."""
     if issubclass(kind, np.random.BitGenerator):
         return np.random.Generator(kind())
@@ -398,7 +398,7 @@ def _is_code(value: object) -> bool:
     return isinstance(value, FunctionType | MethodType)
 
 
-def _own_state(value: object) -> _OwnState | None:
+def _own_state(value: Any) -> _OwnState | None:
     kind = type(value)
     # Of the class, because wrappers may pass on what their objects are asked for
     if hasattr(kind, "state_dict") and hasattr(kind, "load_state_dict"):

@@ -1,6 +1,6 @@
 """Continual DeepMind Control: a chain of tasks of one robot."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, SupportsFloat
 
@@ -110,7 +110,7 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating[A
         return [(self.domain, name) for name in self.task_names] * self.cycles
 
 
-def _known_tasks() -> dict[str, Sequence[str]]:
+def _known_tasks() -> Mapping[str, Sequence[str]]:
     try:
         # Shimmy registers the environments when it is imported, those of dm_control only where that is installed
         import dm_control.suite

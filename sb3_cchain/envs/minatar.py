@@ -41,7 +41,7 @@ class ChannelPadding(gym.ObservationWrapper, RecordConstructorArgs):
                 f"`n_channels` must be at least {self._n_own}, the channels of {env.unwrapped}, got {n_channels!r}"
             )
         self._shape = (*size, int(n_channels))
-        self.observation_space = spaces.Box(0, 1, self._shape, np.bool_)
+        self.observation_space = spaces.Box(0, 1, self._shape, space.dtype)
 
     def observation(self, observation: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """

@@ -53,6 +53,7 @@ class TaskVecNormalize(VecNormalize):
     # Attributes that a saved TaskVecNormalize goes on with; the switches know the task that the statistics are of
     statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch", "_signal_switch"})
 
+    venv: VecEnv
     # Those that were saved by an earlier version do not have it
     returns_over_cuts: bool = False
 
@@ -93,10 +94,10 @@ class TaskVecNormalize(VecNormalize):
             # Resumed training begins with a reset into the first task and another reset into the task that is due. A reset
             # that is not followed by a step must leave nothing behind, or loaded statistics would be lost.
             if self._before_reset is not None:
-                self.__dict__.update(self._before_reset)
+                vars(self).update(self._before_reset)
             # Without normalisation of observations there is no `obs_rms`
-            names = self.statistics.intersection(self.__dict__)
-            self._before_reset = {name: deepcopy(self.__dict__[name]) for name in names}
+            names = self.statistics.intersection(vars(self))
+            self._before_reset = {name: deepcopy(vars(self)[name]) for name in names}
         observation = super().reset()
         if self._enters_task():
             self._restart()
@@ -159,7 +160,7 @@ class TaskVecNormalize(VecNormalize):
         if not self.norm_obs:
             return
         if isinstance(observation, dict):
-            for key, rms in self.obs_rms.items():
+            for key, rms in self.obs_rms.items():  # pyright: ignore[reportAttributeAccessIssue]
                 rms.update(observation[key])
         else:
             self.obs_rms.update(observation)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch as th
 from torch import nn
@@ -57,7 +57,7 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
         (1 + unit * 2.0**-22).to(layer.weight).requires_grad_()
         for layer, unit in zip(layers, th.arange(1, sum(sizes) + 1).split(sizes), strict=True)
     ]
-    tag_of = dict(zip(layers, tags, strict=True))
+    tag_of: dict[nn.Module, th.Tensor] = dict(zip(layers, tags, strict=True))
     arrived: dict[nn.Module, th.Tensor] = {}
 
     def send_tags(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> th.Tensor | None:
@@ -169,7 +169,7 @@ def hidden_activity(
     return [sum_of_places(layer, activity) / sum_of_places(layer, ones) for layer in layers]
 
 
-def _is_layer(module: nn.Module) -> bool:
+def _is_layer(module: nn.Module) -> TypeGuard[nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d]:
     return isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)) and getattr(module, "groups", 1) == 1
 
 

@@ -78,7 +78,7 @@ class LeanCategorical(CategoricalDistribution):
         :param action_logits: Logits, ``(batch_size, n_actions)``
         :return: self
         """
-        self.__dict__.pop("distribution", None)
+        vars(self).pop("distribution", None)
         self._action_logits = action_logits
         self._lean = _Categorical(action_logits)
         return self
@@ -122,7 +122,7 @@ class LeanMultiCategorical(MultiCategoricalDistribution):
         :param action_logits: Logits of all sub-actions, ``(batch_size, sum of their numbers of values)``
         :return: self
         """
-        self.__dict__.pop("distribution", None)
+        vars(self).pop("distribution", None)
         self._action_logits = action_logits.split(list(self.action_dims), dim=1)
         self._lean = [_Categorical(logits) for logits in self._action_logits]
         return self
@@ -169,7 +169,7 @@ class LeanBernoulli(BernoulliDistribution):
         :param action_logits: Logits, ``(batch_size, n_sub_actions)``
         :return: self
         """
-        self.__dict__.pop("distribution", None)
+        vars(self).pop("distribution", None)
         self._action_logits = action_logits
         return self
 
@@ -214,7 +214,7 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :param log_std: Logarithms of the standard deviations, ``(action_dim,)``
         :return: self
         """
-        self.__dict__.pop("distribution", None)
+        vars(self).pop("distribution", None)
         self._mean = mean_actions
         self._std = th.ones_like(mean_actions) * log_std.exp()
         return self
