@@ -130,7 +130,7 @@ def _renew_world(env: gym.Env) -> None:
     box2d = sys.modules.get("Box2D")
     world = getattr(env, "world", None)
     if box2d is not None and isinstance(world, box2d.b2World) and hasattr(env, "_destroy"):
-        env._destroy()
+        env._destroy()  # pyright: ignore[reportAttributeAccessIssue]
         env.world = box2d.b2World(gravity=world.gravity)  # type: ignore[attr-defined]
 
 

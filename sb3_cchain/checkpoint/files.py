@@ -122,7 +122,7 @@ def load_statistics(normalize: VecNormalize, path: str | Path) -> None:
     :param path: What ``VecNormalize.save()`` wrote
     :raises ValueError: When one of both normalises observations and the other does not
     """
-    saved = VecNormalize.load(str(path), normalize.venv)
+    saved = VecNormalize.load(str(path), normalize.venv)  # pyright: ignore[reportArgumentType]
     if saved.norm_obs != normalize.norm_obs:
         raise ValueError(
             f"The statistics in {path} are of norm_obs={saved.norm_obs}, but training has norm_obs={normalize.norm_obs}. "

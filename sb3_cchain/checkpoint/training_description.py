@@ -105,7 +105,8 @@ def _word(value: Any) -> str | None:
         return repr(value)
     if callable(value):
         try:
-            return f"schedule {[float(value(progress)) for progress in (1.0, 0.5, 0.0)]}"
+            values = [float(value(progress)) for progress in (1.0, 0.5, 0.0)]  # pyright: ignore[reportArgumentType]
+            return f"schedule {values}"
         except Exception:  # no schedule
             return None
     return None

@@ -132,7 +132,7 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         enabled = gc.isenabled()
         gc.disable()
         try:
-            game = _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
+            game: Any = _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
             _ = game._c_lib.libenv_close
         finally:
             if enabled:
@@ -158,11 +158,11 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
             self._game = self.launch(1, rand_seed, num_threads=0)
             self._next_observation = self._game.observe()[1]["rgb"][0]
         elif self._next_observation is None:
-            self._game.act(np.array([NEW_EPISODE]))
+            self._game.act(np.array([NEW_EPISODE]))  # pyright: ignore[reportArgumentType]
             self._next_observation = self._game.observe()[1]["rgb"][0]
         observation = self._observation = self._next_observation
         self._next_observation = None
-        return observation, {}
+        return observation, {}  # pyright: ignore[reportReturnType]
 
     def step(self, action: np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
         """
@@ -177,7 +177,7 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
             raise gym.error.ResetNeeded("Call reset() before step()")
         if not 0 <= action < N_ACTIONS:
             raise ValueError(f"An action must be an integer between 0 and {N_ACTIONS - 1}, got {action!r}")
-        self._game.act(np.array([action]))
+        self._game.act(np.array([action]))  # pyright: ignore[reportArgumentType]
         rewards, observations, ended = self._game.observe()
         observation, terminated = observations["rgb"][0], bool(ended[0])
         if terminated:

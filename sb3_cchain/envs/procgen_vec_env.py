@@ -67,7 +67,7 @@ class ContinualProcgenVecEnv(VecEnv):
         if seed is not None or self._games is None or switched:
             self._launch()
         else:
-            self._games.act(np.full(self.num_envs, NEW_EPISODE))
+            self._games.act(np.full(self.num_envs, NEW_EPISODE))  # pyright: ignore[reportArgumentType]
             self._observations = self._games.observe()[1]["rgb"]
         self._begin_episodes(range(self.num_envs))
         return self._observations.copy()
@@ -101,7 +101,7 @@ class ContinualProcgenVecEnv(VecEnv):
         actions = np.asarray(actions)
         if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= N_ACTIONS:
             raise ValueError(f"Actions must be {self.num_envs} integers between 0 and {N_ACTIONS - 1}, got {actions!r}")
-        self._games.act(actions)
+        self._games.act(actions)  # pyright: ignore[reportArgumentType]
 
     def step_wait(self) -> VecEnvStepReturn:
         """

@@ -66,7 +66,7 @@ class SpectralRegularization(Penalty):
                 right = F.normalize(matrix.T @ left, dim=0)
                 product = matrix @ right
                 left = F.normalize(product, dim=0)
-            found.append((product.norm(), left, right))
+            found.append((product.norm(), left, right))  # pyright: ignore[reportPossiblyUnboundVariable]
         return found
 
     def penalty(self) -> th.Tensor:

@@ -323,7 +323,7 @@ def make_run_folder(parent: str | Path, name: str) -> Path:
     :param name: Name without its number
     :return: The new folder
     """
-    number = get_latest_run_id(str(parent), name) + 1
+    number = get_latest_run_id(str(parent), name) + 1  # pyright: ignore[reportArgumentType]
     while True:
         folder = Path(parent) / f"{name}_{number}"
         try:
