@@ -1,6 +1,7 @@
 """Double DQN."""
 
 import warnings
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, TypeVar
 
@@ -23,7 +24,7 @@ from sb3_cchain.validation import check_bool
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
-LOSSES = {"huber": F.smooth_l1_loss, "mse": F.mse_loss}
+LOSSES: dict[str, Callable[..., th.Tensor]] = {"huber": F.smooth_l1_loss, "mse": F.mse_loss}
 
 
 class DoubleDQN(ZeroRateWarning, DQN):

@@ -60,7 +60,7 @@ class FiniteCheck(BaseCallback):
                     "Lower the learning rate, set `max_grad_norm`, or scale the rewards."
                 )
 
-    def _check_outputs(self, name: str, outputs: np.ndarray) -> None:
+    def _check_outputs(self, name: str, outputs: NDArray[Any]) -> None:
         if not np.isfinite(outputs).all():
             raise ValueError(
                 f"The policy gave NaN or infinite {name} in the rollout that ended at step {self.num_timesteps} of training, "
@@ -90,7 +90,7 @@ class FiniteCheck(BaseCallback):
         )
 
 
-def _surely_finite(values: NDArray) -> bool:
+def _surely_finite(values: NDArray[Any]) -> bool:
     """All that most steps need: a sum is NaN or infinite if a value is. It may also be too large for finite values."""
     if values.dtype.kind != "f":
         return True

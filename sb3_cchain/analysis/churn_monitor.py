@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -90,7 +91,7 @@ class ChurnMonitor(BaseCallback):
         self._n_missing = 0
         # On the model until the next rollout starts or ends
         self._hooks = TrainingHooks()
-        self._observations: deque[np.ndarray] = deque()
+        self._observations: deque[NDArray[Any]] = deque()
 
     def _init_callback(self) -> None:
         find_outputs(self.model)

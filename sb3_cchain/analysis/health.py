@@ -5,8 +5,8 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -106,7 +106,7 @@ def remember_initial_parameters(model: BaseAlgorithm) -> None:
 def _parameter_health(model: BaseAlgorithm) -> dict[str, float]:
     groups = trained_groups(model)
     health = group_norms("weight_norm", {group: parameters.values() for group, parameters in groups.items()})
-    initial: dict[str, np.ndarray] | None = getattr(model, "initial_parameters", None)
+    initial: dict[str, NDArray[Any]] | None = getattr(model, "initial_parameters", None)
     if initial is not None:
         differences = {
             group: [parameter - th.as_tensor(initial[name], device=model.device) for name, parameter in parameters.items()]

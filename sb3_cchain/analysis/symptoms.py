@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -93,7 +94,7 @@ def _diversity(model: BaseAlgorithm, outputs: ModelOutputs) -> float:
     return _relative_entropy(model.action_space, (counts / counts.sum())[None]).item()
 
 
-def _relative_entropy(space: spaces.Space, probabilities: th.Tensor) -> th.Tensor:
+def _relative_entropy(space: spaces.Space[Any], probabilities: th.Tensor) -> th.Tensor:
     """From 0 to 1, of each distribution, ``(n, n_actions)`` or ``(n, n_sub_actions, max_n)``; mean over sub-actions."""
     entropy = th.special.entr(probabilities).sum(dim=-1)
     if isinstance(space, spaces.Discrete):
@@ -259,7 +260,7 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
     return symptoms
 
 
-def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[np.ndarray, np.ndarray, float]:
+def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[NDArray[Any], NDArray[Any], float]:
     """Values, their targets, and the greatest value that the rewards can add up to."""
     assert model.replay_buffer is not None
     sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)

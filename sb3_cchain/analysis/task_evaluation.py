@@ -200,7 +200,7 @@ def _single_envs(env: VecEnv) -> list[Any]:
     return [single.unwrapped for single in getattr(env.unwrapped, "envs", [env])]
 
 
-def _measures(space: gym.Space) -> Any:
+def _measures(space: gym.Space[Any]) -> Any:
     """What two spaces must have in common: shapes, and the numbers of discrete choices. Limits may differ."""
     if isinstance(space, spaces.Dict):
         return {key: _measures(part) for key, part in space.items()}

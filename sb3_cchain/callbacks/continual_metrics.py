@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.callbacks.log_folder import log_folder
@@ -153,7 +154,7 @@ class ContinualMetrics(BaseCallback):
         self._rollout_reward += reward
         self._rollout_steps += len(infos)
 
-    def _count_episodes(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
+    def _count_episodes(self, infos: list[dict[str, Any]], dones: NDArray[np.bool_]) -> None:
         state, ended = self._state, np.flatnonzero(dones)
         began = first_reset_info(self.training_env)
         # An environment that numbers its tasks may end them by cutting the episodes. A switch by the word of another cuts none

@@ -1,6 +1,9 @@
 """Rollouts, advantages and value targets as in the paper's PPO."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 
@@ -51,8 +54,8 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
 
 
 def discounted_returns(
-    rewards: np.ndarray, episode_starts: np.ndarray, last_values: np.ndarray, last_dones: np.ndarray, gamma: float
-) -> np.ndarray:
+    rewards: NDArray[Any], episode_starts: NDArray[Any], last_values: NDArray[Any], last_dones: NDArray[np.bool_], gamma: float
+) -> NDArray[Any]:
     """
     :param rewards: ``(n_steps, n_envs)``
     :param episode_starts: Whether a step is the first of its episode, ``(n_steps, n_envs)``

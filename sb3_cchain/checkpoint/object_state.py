@@ -28,6 +28,7 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
 from stable_baselines3.common.monitor import ResultsWriter
 
 # They belong to the process: code, files and their places, and how something was made
@@ -364,23 +365,23 @@ class StateUnpickler(pickle.Unpickler):
         return self._objects[reference]
 
 
-def _owner(array: np.ndarray) -> np.ndarray:
+def _owner(array: NDArray[Any]) -> NDArray[Any]:
     """The array that the memory belongs to, if it can be asked for a part of it; otherwise the array itself."""
     base = array.base
     return base if isinstance(base, np.ndarray) and base.flags.c_contiguous and not base.dtype.hasobject else array
 
 
-def _address(array: np.ndarray) -> int:
+def _address(array: NDArray[Any]) -> int:
     return array.__array_interface__["data"][0]
 
 
-def _is_transposed(array: np.ndarray) -> bool:
+def _is_transposed(array: NDArray[Any]) -> bool:
     """Whether axes have another order in memory, as those of transposed images. An axis of length 1 has a place there, too."""
     compact = [array.itemsize * math.prod(array.shape[axis + 1 :]) for axis in range(array.ndim)]
     return array.size > 0 and list(array.strides) != compact and not array.flags.fnc
 
 
-def _transposed(array: np.ndarray) -> Any:
+def _transposed(array: NDArray[Any]) -> Any:
     # Pickle would lay it out otherwise, and convolutions round otherwise then
     order = sorted(range(array.ndim), key=lambda axis: (-abs(array.strides[axis]), array.shape[axis] == 1))
     return np.transpose, (np.array(array.transpose(order), order="C"), np.argsort(order).tolist())

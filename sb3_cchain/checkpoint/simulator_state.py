@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_cchain.checkpoint.object_state import register_state
 
@@ -93,7 +94,7 @@ def _restore_model(model: Any, state: dict[str, Any]) -> None:
                 setattr(getattr(model, part), name, value.item())
 
 
-def _arrays(model: Any) -> dict[str, np.ndarray]:
+def _arrays(model: Any) -> dict[str, NDArray[Any]]:
     found = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
     arrays = {name: value for name, value in found.items() if isinstance(value, np.ndarray) and value.size}
     return {name: np.ascontiguousarray(value) for name, value in arrays.items()}

@@ -43,7 +43,7 @@ class FlatDMControl(gym.Wrapper, RecordConstructorArgs):
         fps = round(1 / env.unwrapped.dt)  # type: ignore[attr-defined]
         self.metadata = {**env.metadata, "render_modes": ["human", "rgb_array"], "render_fps": fps}
 
-    def _flatten(self, observation: dict[str, NDArray]) -> NDArray[np.float32]:
+    def _flatten(self, observation: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         # A few times faster than `spaces.flatten` and a cast
         parts = [observation[name].reshape(-1) for name in self._names]
         return np.concatenate(parts, dtype=np.float32, casting="same_kind")

@@ -46,7 +46,7 @@ class ObservationOffset(gym.ObservationWrapper, RecordConstructorArgs):
             raise ValueError(f"`offset` must be finite, got {offset!r}")
         self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)
 
-    def observation(self, observation: NDArray) -> NDArray:
+    def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
         """
         :param observation: Of the wrapped environment
         :return: The observation plus the offset
@@ -129,7 +129,7 @@ class ContinualGymControl(ContinualEnv):
         before, own = (self.offsets[task % len(self.offsets)] for task in (self.task_id - 1, self.task_id))
         self._missing_offset = ((1 - weight) * (before - own)).astype(np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
         """
         :param seed: Seeds this and all later tasks
         :param options: Passed on to the task
@@ -138,7 +138,7 @@ class ContinualGymControl(ContinualEnv):
         observation, info = super().reset(seed=seed, options=options)
         return self._drifting(observation), info
 
-    def step(self, action: Any) -> tuple[NDArray, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[Any], SupportsFloat, bool, bool, dict[str, Any]]:
         """
         :param action: The action
         :return: Observation, reward, terminated, truncated, info
@@ -146,7 +146,7 @@ class ContinualGymControl(ContinualEnv):
         observation, reward, terminated, truncated, info = super().step(action)
         return self._drifting(observation), reward, terminated, truncated, info
 
-    def _drifting(self, observation: NDArray) -> NDArray:
+    def _drifting(self, observation: NDArray[Any]) -> NDArray[Any]:
         is_itself = not self.blend_steps or self._weights.get(self.task_id, 1.0) == 1
         return observation if is_itself else observation + self._missing_offset
 
@@ -176,6 +176,6 @@ def _observation_shape(env_id: str) -> tuple[int, ...]:
     return env.observation_space.shape
 
 
-def _make_task(env_id: str, offset: NDArray, **kwargs: Any) -> gym.Env:
+def _make_task(env_id: str, offset: NDArray[Any], **kwargs: Any) -> gym.Env:
     # The checker around the continual environment suffices
     return ObservationOffset(gym.make(env_id, max_episode_steps=-1, disable_env_checker=True, **kwargs), offset)

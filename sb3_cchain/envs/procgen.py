@@ -43,7 +43,7 @@ GAME_NAMES = (
 GAMES = tuple(name.lower() for name in GAME_NAMES)
 # The games of each mode. Procgen ends the process where a game does not have the mode. Its "exploration" is left out: it is
 # the hard mode on one certain level, which leaves no choice of levels.
-DISTRIBUTION_MODES = {
+DISTRIBUTION_MODES: dict[str, tuple[str, ...]] = {
     "easy": GAMES,
     "hard": GAMES,
     "extreme": ("chaser", "dodgeball", "leaper", "starpilot"),

@@ -180,7 +180,7 @@ class ContinualProcgenVecEnv(VecEnv):
             self._games.close()
         self._games = None
 
-    def get_images(self) -> Sequence[np.ndarray | None]:
+    def get_images(self) -> Sequence[NDArray[Any] | None]:
         """
         :return: The observations, without a render mode ``None`` for each
         """

@@ -1,5 +1,7 @@
 """The table of registered environments."""
 
+from typing import Any
+
 import gymnasium as gym
 
 from sb3_cchain.envs.procgen import GAME_NAMES
@@ -10,7 +12,7 @@ from sb3_cchain.envs.procgen import GAME_NAMES
 _GYM_CONTROL = {"entry_point": "sb3_cchain.envs.gym_control:ContinualGymControl", "max_episode_steps": 400}
 _DM_CONTROL = "sb3_cchain.envs.dm_control:ContinualDMControl"
 _PROCGEN = "sb3_cchain.envs.procgen:ContinualProcgen"
-CONTINUAL_ENVS: dict[str, dict] = {
+CONTINUAL_ENVS: dict[str, dict[str, Any]] = {
     "CartPole-v1": {**_GYM_CONTROL, "kwargs": {"env_id": "CartPole-v1"}},
     "Acrobot-v1": {**_GYM_CONTROL, "kwargs": {"env_id": "Acrobot-v1"}},
     "LunarLander-v3": {**_GYM_CONTROL, "kwargs": {"env_id": "LunarLander-v3"}},
@@ -27,7 +29,7 @@ CONTINUAL_ENVS: dict[str, dict] = {
 }
 
 # Those that the paper does not have
-OTHER_ENVS: dict[str, dict] = {
+OTHER_ENVS: dict[str, dict[str, Any]] = {
     "SlipperyAnt-v0": {"entry_point": "sb3_cchain.envs.slippery_ant:ContinualSlipperyAnt"},
     "MiniGrid-v0": {"entry_point": "sb3_cchain.envs.minigrid:ContinualMiniGrid"},
     "Atari-v0": {"entry_point": "sb3_cchain.envs.atari:ContinualAtari"},

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepRetu
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.validation import check_bool
 
-Observation = NDArray | dict[str, NDArray]
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 class TaskVecNormalize(VecNormalize):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch.optim.optimizer import ParamsT
 
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
@@ -102,7 +103,7 @@ class TRAC(OptimizerWrapper):
         return {**super().metrics(), "trac/scale": max(self.own_state.get("scale", 0.0), 0.0)}
 
 
-def _weideman_coefficients(n: int = 128) -> tuple[float, np.ndarray]:
+def _weideman_coefficients(n: int = 128) -> tuple[float, NDArray[Any]]:
     """
     Coefficients of Weideman's rational approximation of w(z) = exp(−z²) erfc(−iz) (SIAM J. Numer. Anal. 31(5), 1994). He takes
     4n points and the value 0 at infinity. trac-optimizer leaves out the value at infinity, so it is left out here too.
@@ -119,7 +120,7 @@ def _weideman_coefficients(n: int = 128) -> tuple[float, np.ndarray]:
 _L, _COEFFICIENTS = _weideman_coefficients()
 
 
-def erfi(x: np.ndarray) -> np.ndarray:
+def erfi(x: NDArray[Any]) -> NDArray[Any]:
     """
     The imaginary error function as ``trac-optimizer`` computes it: up to 1.1 % too small near 0, 0.2 % too large at 2.
 

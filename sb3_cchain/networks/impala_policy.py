@@ -28,7 +28,7 @@ class ImpalaPolicy(ActorCriticCnnPolicy):
     def __init__(
         self,
         observation_space: spaces.Box,
-        action_space: spaces.Space,
+        action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         *,
         net_arch: list[int] | dict[str, list[int]] | None = None,

@@ -112,7 +112,7 @@ def read_saved(path: Path) -> dict[str, Any]:
     return content
 
 
-def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict:
+def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict[str, Any]:
     if not isinstance(node, yaml.SequenceNode):
         raise yaml.constructor.ConstructorError(None, None, "an OrderedDict must be a list of pairs", node.start_mark)
     (pairs,) = loader.construct_sequence(node, deep=True) or ([],)
