@@ -68,8 +68,8 @@ class ChurnAlgorithm(ZeroRateWarning):
         self.churn_target = churn_target
         self.churn_coef = churn_coef
         self.target_churn_ratio = target_churn_ratio
-        self.churn_warmup = kind.warmup if churn_warmup is None else churn_warmup
-        self.churn_window = kind.window if churn_window is None else churn_window
+        self.churn_warmup: int = kind.warmup if churn_warmup is None else churn_warmup
+        self.churn_window: int = kind.window if churn_window is None else churn_window
         self.churn_coef_min = churn_coef_min
         self.reset_churn_coef = reset_churn_coef
         # Raise on bad values before an environment is made

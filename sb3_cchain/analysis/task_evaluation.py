@@ -73,7 +73,7 @@ class TaskEvaluation(BaseCallback):
         self.interval = interval
         self.deterministic = deterministic
         self.seed = seed
-        self.path = None if path is None else Path(path)
+        self.path: Path | None = None if path is None else Path(path)
         self._file: ReturnsFile | None = None
         self._last_step = 0
 
@@ -95,7 +95,7 @@ class TaskEvaluation(BaseCallback):
         add_overview(self.model)
         is_new = self.num_timesteps == 0
         past = [] if is_new else getattr(self.model, self.kept_as, [])
-        self.rows = [row for row in past if row["timesteps"] <= self.num_timesteps]
+        self.rows: list[dict[str, Any]] = [row for row in past if row["timesteps"] <= self.num_timesteps]
         setattr(self.model, self.kept_as, self.rows)
         folder = log_folder(self.model)
         path = self.path or (folder / self.file_name if folder is not None else None)

@@ -39,7 +39,7 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self.info: dict[str, Any] = _read_info(self.path)
         for name, expected in self.info["files"].items():
             file = self.path / name

@@ -26,7 +26,7 @@ class ChurnCoefficient(nn.Module):
     def __init__(self, initial: float):
         super().__init__()
         _check_factor("churn_coef", initial)
-        self.initial = float(initial)
+        self.initial: float = float(initial)
 
     @property
     def value(self) -> float:
@@ -91,9 +91,9 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         check_number("churn_warmup", warmup, minimum=0, integer=True)
         check_number("churn_window", window, minimum=1, integer=True)
         _check_factor("churn_coef_min", minimum)
-        self.target_ratio = float(target_ratio)
+        self.target_ratio: float = float(target_ratio)
         self.warmup = warmup
-        self.minimum = float(minimum)
+        self.minimum: float = float(minimum)
         self.register_buffer("base_losses", th.zeros(window, dtype=th.float64, device="cpu"))
         self.register_buffer("churn_losses", th.zeros(window, dtype=th.float64, device="cpu"))
         # Of the base and the churn losses in the window

@@ -59,12 +59,14 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     ):
         tasks = _check_tasks(tasks)
         check_number("cycles", cycles, 1, integer=True)
-        self.cycles = int(cycles)
-        self.steps_per_task = _check_steps_per_task(steps_per_task, len(tasks)) * self.cycles
-        self.blend_steps = self._check_blend_steps(blend_steps)
+        self.cycles: int = int(cycles)
+        self.steps_per_task: list[int] = _check_steps_per_task(steps_per_task, len(tasks)) * self.cycles
+        self.blend_steps: int = self._check_blend_steps(blend_steps)
         # The time of the sequence, and the task of the present episode
-        self.clock = TaskClock(self.steps_per_task, n_envs, first_task)
-        self.tasks = [_make_task(position, task, render_mode) for position, task in enumerate(tasks * self.cycles)]
+        self.clock: TaskClock = TaskClock(self.steps_per_task, n_envs, first_task)
+        self.tasks: list[gym.Env] = [
+            _make_task(position, task, render_mode) for position, task in enumerate(tasks * self.cycles)
+        ]
         _check_spaces(self.tasks)
 
         self.observation_space = self.tasks[0].observation_space

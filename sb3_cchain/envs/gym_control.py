@@ -37,7 +37,7 @@ class ObservationOffset(gym.ObservationWrapper, RecordConstructorArgs):
             # The offset would be rounded, and the sum would overflow
             raise TypeError(f"An observation offset needs Box observations of floating-point numbers, got {space}")
         try:
-            self.offset = np.array(offset, dtype=space.dtype)
+            self.offset: NDArray[Any] = np.array(offset, dtype=space.dtype)
         except (TypeError, ValueError) as error:
             raise ValueError(f"`offset` must be an array of numbers, got {offset!r}") from error
         if self.offset.shape != space.shape:

@@ -53,7 +53,7 @@ class Oracle(TaskBoundary):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.n_resets = 0
+        self.n_resets: int = 0
 
     def _on_task_switch(self) -> None:
         policy, fresh = uncompiled(self.model.policy), fresh_policy(self.model)

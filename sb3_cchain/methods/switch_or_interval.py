@@ -30,7 +30,7 @@ class SwitchOrInterval(TaskBoundary):
         self.interval = interval
 
     def _on_training_start(self) -> None:
-        self.n_resets = 0
+        self.n_resets: int = 0
         if self.interval is None:
             super()._on_training_start()
         # As long as nobody looked, the step that training goes on from

@@ -41,7 +41,7 @@ class UnitRecycling(BaseCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.n_recycled = 0
+        self.n_recycled: int = 0
         policy = uncompiled(self.model.policy)
         with evaluation_mode(policy):
             self._layers = self._find_layers(policy, self._forward(_zeros(self.model)))

@@ -20,6 +20,10 @@ class _ImageExtractor(BaseFeaturesExtractor):
 
     cnn: nn.Sequential
     linear: nn.Sequential
+    channels_first: bool
+    n_channels: int
+    height: int
+    width: int
 
     def __init__(self, observation_space: spaces.Box, features_dim: int, min_size: int = 1):
         super().__init__(observation_space, features_dim)

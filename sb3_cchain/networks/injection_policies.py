@@ -23,8 +23,8 @@ class Injectable(nn.Module):
     def __init__(self, network: nn.Module):
         super().__init__()
         self.old = network
-        self.new = copy.deepcopy(network)
-        self.copy = copy.deepcopy(network)
+        self.new: nn.Module = copy.deepcopy(network)
+        self.copy: nn.Module = copy.deepcopy(network)
         # Saved with the parameters
         self.register_buffer("is_injected", th.tensor(False))
         self._freeze()

@@ -54,7 +54,7 @@ class _MlpVariant(ActorCriticPolicy):
         policy_net, extractor.latent_dim_pi = hidden_layers(self.features_dim, pi, *settings)
         value_net, extractor.latent_dim_vf = hidden_layers(self.features_dim, vf, *settings)
         extractor.policy_net, extractor.value_net = nn.Sequential(*policy_net), nn.Sequential(*value_net)
-        self.mlp_extractor = extractor.to(self.device)
+        self.mlp_extractor: MlpExtractor = extractor.to(self.device)
 
 
 class LayerNormPolicy(_MlpVariant):

@@ -21,13 +21,13 @@ class TaskClock:
     """
 
     def __init__(self, steps_per_task: Sequence[int], n_envs: int = 1, first_task: int = 0):
-        self.n_tasks = len(steps_per_task)
+        self.n_tasks: int = len(steps_per_task)
         check_number("first_task", first_task, 0, self.n_tasks - 1, integer=True)
         # Total steps at which each task ends, except for the last task, which does not end
         self._ends = list(accumulate(steps_per_task))[:-1]
         self._first_step = [0, *self._ends][first_task]
-        self.first_task = int(first_task)
-        self.task_id = self.first_task
+        self.first_task: int = int(first_task)
+        self.task_id: int = self.first_task
         self._pinned_task: int | None = None
         self.set(0, n_envs)
 
@@ -72,7 +72,7 @@ class TaskClock:
         check_number("total_steps", total_steps, 0, integer=True)
         if n_envs is not None:
             check_number("n_envs", n_envs, 1, integer=True)
-            self.n_envs = int(n_envs)
+            self.n_envs: int = int(n_envs)
         self._total_steps = self._first_step + int(total_steps)
         self._pinned_task = None
 

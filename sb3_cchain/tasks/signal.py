@@ -30,7 +30,7 @@ class TaskSwitch:
     """
 
     def __init__(self, task_id: Any = None):
-        self.task_id = task_id
+        self.task_id: Any = task_id
 
     def happened(self, task_id: Any) -> bool:
         """
