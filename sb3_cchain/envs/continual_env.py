@@ -69,8 +69,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
         ]
         _check_spaces(self.tasks)
 
-        self.observation_space = self.tasks[0].observation_space
-        self.action_space = self.tasks[0].action_space
+        self.observation_space: gym.Space[ObsType] = self.tasks[0].observation_space
+        self.action_space: gym.Space[ActType] = self.tasks[0].action_space
         self.metadata = self.tasks[0].metadata
         self.render_mode = render_mode
         self._seeded: set[int] = set()

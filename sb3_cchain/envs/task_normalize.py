@@ -148,7 +148,7 @@ class TaskVecNormalize(VecNormalize):
 
     def _restart(self) -> None:
         if self.norm_obs:
-            self.last_task_obs_rms = self.obs_rms
+            self.last_task_obs_rms: Any = self.obs_rms
             rms: Any = self.obs_rms
             if isinstance(rms, dict):
                 self.obs_rms = {key: _fresh(part) for key, part in rms.items()}
