@@ -52,6 +52,7 @@ check-codestyle: install
 
 type: install
 	$(BIN)/mypy
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 commit-checks: format type lint
 
