@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.run import make_run, suite_methods
-from benchmarks.grid.suites import SUITES, paper_length
+from benchmarks.grid.suites import SUITES, check_env_id, paper_length
 from benchmarks.report.figures import plot_learning_curves
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.random_policy import look_at_task
@@ -41,6 +41,7 @@ def main() -> None:
 
     env_id = args.env or SUITES[args.suite].env_ids[0]
     try:
+        check_env_id(args.suite, env_id)
         paper = paper_length(env_id)
         n_tasks, steps = args.n_tasks or paper[0], args.steps_per_task or paper[1]
         experiment = f"compare_{n_tasks}x{steps}"
@@ -49,7 +50,7 @@ def main() -> None:
             for seed in args.seeds
             for method in args.method
         ]
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.error(str(error))
     results = train_all(runs, args.output, args.jobs)
 

@@ -75,7 +75,7 @@ def main() -> None:
             for env_id in env_ids
             for name in args.variants
         ]
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.error(str(error))
     results = train_all(runs, args.output, args.jobs)
     for env_id in env_ids:

@@ -16,12 +16,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_cchain import CChainPPO
 from sb3_cchain.envs import ContinualDMControl, FlatDMControl, TaskVecNormalize
 from tests.envs import RandomEnv
+from tests.extras import needs_dm_control
 
 try:
     from dm_control import suite
 except ModuleNotFoundError:
     suite = None
-needs_dm_control = pytest.mark.skipif(suite is None, reason="dm_control is not installed")
 
 SEQUENCES = {
     "Walker": ("walker", ["stand", "walk", "run"], 24, 6),

@@ -41,6 +41,7 @@ from benchmarks.grid.training import evaluation_metrics, metrics_rows
 from benchmarks.grid.view import Failure, Progress, View, duration
 from benchmarks.run import main
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
+from tests.extras import needs_dm_control, needs_procgen
 from tests.fake_training import fake_program, save_checkpoint
 
 RUN = Run("gym_control", "Continual/CartPole-v1", "cchain", 0, 2, 800, "smoke")
@@ -293,7 +294,8 @@ def test_lengths():
     assert run_length("minatar", "Continual/MinAtar-v0", "smoke") == (2, 200)
 
 
-@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
+@needs_dm_control
+@needs_procgen
 def test_the_grid_of_all_suites():
     grid = grid_runs(list(SUITES), budget="paper")
     expected = dict(gym_control=4 * 6 * 6, procgen=16 * 9 * 6, dmc=3 * 3 * 12, minatar=1 * 3 * 12)
@@ -311,12 +313,11 @@ def test_suites_cover_the_environments():
         assert suite.demo.env_id in suite.env_ids and "vanilla" in suite.rates
 
 
-@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
 @pytest.mark.parametrize(
     "suite, env_id, names",
     [
-        ("procgen", "Continual/Maze-v0", ("level 20", "level 21")),
-        ("dmc", "Continual/Walker-v0", ("stand", "walk")),
+        pytest.param("procgen", "Continual/Maze-v0", ("level 20", "level 21"), marks=needs_procgen),
+        pytest.param("dmc", "Continual/Walker-v0", ("stand", "walk"), marks=needs_dm_control),
         ("gym_control", "Continual/CartPole-v1", ("task 0", "task 1")),
         ("minatar", "Continual/MinAtar-v0", ("SpaceInvaders", "Asterix")),
     ],
@@ -349,10 +350,10 @@ def test_a_run_is_the_command_that_a_user_would_type():
     [
         ("minatar", "Continual/MinAtar-v0", 1_500_000, 50_000, True),
         ("minatar", "Continual/MinAtar-v0", 150_000, 5000, True),
-        ("dmc", "Continual/Walker-v0", 1_000_000, 20_000, False),
+        pytest.param("dmc", "Continual/Walker-v0", 1_000_000, 20_000, False, marks=needs_dm_control),
         # Evaluations of 10 000 steps are not affordable more often
-        ("dmc", "Continual/Walker-v0", 100_000, 20_000, False),
-        ("dmc", "Continual/Walker-v0", 4096, 4096, False),
+        pytest.param("dmc", "Continual/Walker-v0", 100_000, 20_000, False, marks=needs_dm_control),
+        pytest.param("dmc", "Continual/Walker-v0", 4096, 4096, False, marks=needs_dm_control),
     ],
 )
 def test_evaluations_are_the_papers(suite, env_id, steps, interval, deterministic):
@@ -372,7 +373,13 @@ def test_evaluations_are_the_papers(suite, env_id, steps, interval, deterministi
 @pytest.mark.parametrize(
     "changes, message",
     [
-        (dict(suite="dmc", env_id="Continual/Walker-v0", n_tasks=5), "`n_tasks` must be at most 3, the tasks of .*; got 5"),
+        pytest.param(
+            *(
+                dict(suite="dmc", env_id="Continual/Walker-v0", n_tasks=5),
+                "`n_tasks` must be at most 3, the tasks of .*; got 5",
+            ),
+            marks=needs_dm_control,
+        ),
         (dict(seed=-1), "`seed` must be at least 0; got -1"),
         (dict(steps_per_task=0), "`steps_per_task` must be at least 1; got 0"),
         (dict(env_id="Continual/Maze-v0"), "`env_id` must be one of Continual/CartPole-v1, .*; got Continual/Maze-v0"),
@@ -429,6 +436,7 @@ def test_errors_come_before_any_work(arguments, message, tmp_path, capsys, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@needs_procgen
 def test_an_empty_grid_is_an_error(capsys):
     with pytest.raises(SystemExit):
         main(["--suite", "all", "--method", "parseval", "--env", "Continual/Starpilot-v0"])
@@ -631,11 +639,12 @@ def test_a_failed_run_says_why(trained):
     assert "/smoke/gym_control/Continual-Acrobat-v1/cchain/seed_0/attempt_" in failure.log
 
 
-@pytest.mark.skipif(sys.version_info >= (3, 13), reason="no wheels")
 @pytest.mark.parametrize(
     "suite, env_id, method, names, overrides",
     [
-        ("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"], ["n_epochs:1"]),
+        pytest.param(
+            *("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"], ["n_epochs:1"]), marks=needs_procgen
+        ),
         ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"], []),
     ],
 )

@@ -27,6 +27,7 @@ from sb3_cchain.callbacks import read_returns
 from sb3_cchain.envs import RewardScale, TaskCaption, TaskVecNormalize
 from sb3_cchain.envs.task_caption import with_caption
 from sb3_cchain.methods.registry import REGISTRY
+from tests.extras import needs_dm_control
 from tests.zoo_command import FAST, NO_EVALUATION, ROOT, SHORT_PPO, command, run, stock_train
 
 ACROBOT = (
@@ -177,7 +178,7 @@ def test_oracle_of_minatar_begins_each_game_with_an_empty_buffer(tmp_path):
     assert load_from_pkl(folder / "replay_buffer.pkl").size() == 50
 
 
-@pytest.mark.skipif(sys.version_info >= (3, 13), reason="dm_control has no wheels")
+@needs_dm_control
 def test_walker_with_normalisation_that_restarts(tmp_path, capsys):
     command(
         *("train", "--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-n", "400", "-f", tmp_path, "--seed", "1", *FAST),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.grid.strengths import read_strength, split_line, strength_override, with_strength
-from benchmarks.grid.suites import SUITES, paper_length
+from benchmarks.grid.suites import SUITES, check_env_id, paper_length
 from sb3_cchain.methods.registry import BY_ALGO, METHOD_NAMES, REGISTRY, Method, Strength
 from sb3_cchain.zoo.settings import read_settings
 
@@ -159,13 +159,13 @@ def make_run(
     :return: The run
     :raises ValueError: When the method has no settings for the environment, for another strength that cannot be, for more
         tasks than the environment has, for no evaluation in a task, or for a negative seed
+    :raises ImportError: When a package that the environment needs is not installed
     """
     method, strength = split_line(method)
     for argument, value, least in (("seed", seed, 0), ("n_tasks", n_tasks, 1), ("steps_per_task", steps_per_task, 1)):
         if value < least:
             raise ValueError(f"`{argument}` must be at least {least}; got {value}")
-    if env_id not in SUITES[suite].env_ids:
-        raise ValueError(f"`env_id` must be one of {', '.join(SUITES[suite].env_ids)}; got {env_id}")
+    check_env_id(suite, env_id)
     if method not in (allowed := available_methods(suite, env_id)):
         raise ValueError(f"`method` must be one of {', '.join(allowed)} in {env_id}; got {method}")
     if "n_tasks" not in SUITES[suite].env_kwargs(n_tasks, seed) and n_tasks > paper_length(env_id)[0]:

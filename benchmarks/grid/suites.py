@@ -163,10 +163,21 @@ SUITES = {
 
 
 @cache
+def check_env_id(suite: str, env_id: str) -> None:
+    """
+    :param suite: Name of a suite
+    :param env_id: Environment id
+    :raises ValueError: When it is none of the suite
+    """
+    if env_id not in SUITES[suite].env_ids:
+        raise ValueError(f"`env_id` must be one of {', '.join(SUITES[suite].env_ids)}; got {env_id}")
+
+
 def paper_length(env_id: str) -> tuple[int, int]:
     """
     :param env_id: Environment id
     :return: The paper's number of tasks, and environment steps per task: the environment's defaults
+    :raises ImportError: When a package that the environment needs is not installed
     """
     env = gym.make(env_id)
     task_sequence: Any = env.unwrapped

@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     try:
         runs = chosen_runs(args)
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.error(str(error))
     if args.dry_run:
         list_grid(runs, args.results, args.logs, Console())
