@@ -101,7 +101,7 @@ def make(env_id, subproc=False, seed=0):
         return env
     kwargs = {}
     if subproc:
-        kwargs = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, wrapper_class=ResumableEnv)
+        kwargs = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"}, wrapper_class=ResumableEnv)
     return begin(make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=arguments, **kwargs))
 
 
@@ -471,7 +471,7 @@ def test_another_environment():
 
 @pytest.mark.parametrize("wrapper", [None, lambda env: Monitor(ResumableEnv(env))])
 def test_processes_need_the_outermost_wrapper(wrapper):
-    kwargs = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}, wrapper_class=wrapper)
+    kwargs = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"}, wrapper_class=wrapper)
     env = make_vec_env("CartPole-v1", **kwargs)
     with pytest.raises(ValueError, match=r"outermost wrapper: make_vec_env\(.*wrapper_class=ResumableEnv"):
         prepare_environment(env)
@@ -480,7 +480,7 @@ def test_processes_need_the_outermost_wrapper(wrapper):
 
 @pytest.mark.parametrize("kind", [WithSecret, Chaotic])
 def test_errors_come_from_the_other_processes(kind):
-    env, new = (SubprocVecEnv([lambda: ResumableEnv(kind())], start_method="fork") for _ in range(2))
+    env, new = (SubprocVecEnv([lambda: ResumableEnv(kind())], start_method="forkserver") for _ in range(2))
     env.reset(), new.reset()
     with pytest.raises(ValueError, match=f"Environment 0: .*{kind.__name__}.*state_dict"):
         prepare_environment(env)

@@ -201,7 +201,7 @@ def test_pictures_and_processes():
     callback = EvalAllTasks(DummyVecEnv([pictures]), n_eval_episodes=1)
     model = PPO("CnnPolicy", pictures(), **ARGUMENTS).learn(32, callback=[TaskSync(), callback])
     assert callback.eval_env.observation_space.shape == (3, 36, 36) and len(model.task_returns) == 3 * 2
-    processes = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+    processes = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="forkserver"))
     env = make_vec_env("Continual/CartPole-v1", 2, env_kwargs=CARTPOLE, **processes)
     model = PPO("MlpPolicy", env, **ARGUMENTS).learn(64, callback=[TaskSync(), EvalAllTasks(n_eval_episodes=1)])
     env.close()

@@ -49,7 +49,7 @@ def sequence(steps_per_task=30, n_envs=1, as_dict=False, **kwargs):
 
 def make_sequence(n_envs=1, vec_env_cls=DummyVecEnv, **kwargs):
     # Forked, because several times faster to start
-    vec_env_kwargs = {"start_method": "fork"} if vec_env_cls is SubprocVecEnv else {}
+    vec_env_kwargs = {"start_method": "forkserver"} if vec_env_cls is SubprocVecEnv else {}
     env_kwargs = {"n_envs": n_envs, **kwargs}
     arguments = dict(env_kwargs=env_kwargs, vec_env_cls=vec_env_cls, vec_env_kwargs=vec_env_kwargs, seed=3)
     return make_vec_env(sequence, n_envs=n_envs, **arguments)

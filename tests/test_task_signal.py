@@ -365,7 +365,7 @@ def test_a_loop_that_begins_as_any_training():
     assert resets == [0, 1, 1] and model.continual_state["n_switches"] == 2
 
 
-@pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))])
+@pytest.mark.parametrize("kwargs", [{}, dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="forkserver"))])
 def test_environments_side_by_side(kwargs):
     oracle = Oracle()
     env = make_vec_env(World, 2, **kwargs)

@@ -230,7 +230,7 @@ def test_infinity_which_tensorboard_cannot_show_is_a_string():
 
 
 def test_an_environment_in_another_process_is_not_asked_for_its_name():
-    env = make_vec_env("CartPole-v1", n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+    env = make_vec_env("CartPole-v1", n_envs=2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="forkserver"))
     values = hyperparameters(PPO("MlpPolicy", env, **SETTINGS))
     env.close()
     assert "env" not in values and values["n_envs"] == 2

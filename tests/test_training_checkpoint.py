@@ -363,7 +363,7 @@ def test_processes_of_environments_do_not_hold_the_lock(path, tmp_path):
     closed = open_locked(tmp_path / "closed", "")
     closed.close()
     folder = CheckpointFolder(path, 2, NEWEST)
-    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
+    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"})
     folder.close()
     CheckpointFolder(path, 2, NEWEST).close()
     env.close()
@@ -673,7 +673,7 @@ def test_two_of_them(tmp_path):
 
 
 def test_environments_in_processes_need_a_wrapper(tmp_path, handlers):
-    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
+    env = make_env(vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "forkserver"})
     model = make(env)
     before = parameters(model)
     with pytest.raises(ValueError, match="ResumableEnv"):
@@ -730,7 +730,7 @@ def test_tasks_and_statistics_outlast_episodes(tmp_path, wrapper, vec_env_cls):
     def make_training_env():
         kwargs = dict(env_kwargs=dict(steps_per_task=60, n_tasks=3, n_envs=2))
         if vec_env_cls is SubprocVecEnv:
-            kwargs["vec_env_kwargs"] = {"start_method": "fork"}
+            kwargs["vec_env_kwargs"] = {"start_method": "forkserver"}
         return wrapper(make_env("Continual/CartPole-v1", n_envs=2, vec_env_cls=vec_env_cls, **kwargs))
 
     def look(model):

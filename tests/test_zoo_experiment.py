@@ -1,8 +1,7 @@
 """Training by the command line: folders of its own, and going on from a saved model."""
 
-import multiprocessing
 import os
-import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -206,10 +205,9 @@ def _make_many(folder):
     return [str(make_run_folder(folder, "run")) for _ in range(20)]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_run_folders_are_never_shared(tmp_path):
-    with multiprocessing.get_context("fork").Pool(4) as pool:
-        made = [folder for folders in pool.map(_make_many, [tmp_path / "runs"] * 4, chunksize=1) for folder in folders]
+    with ThreadPoolExecutor(4) as pool:
+        made = [folder for folders in pool.map(_make_many, [tmp_path / "runs"] * 4) for folder in folders]
     assert sorted(made) == sorted(str(tmp_path / "runs" / f"run_{number}") for number in range(1, 81))
 
 
