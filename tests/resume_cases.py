@@ -88,8 +88,8 @@ def vec_env(env_id, n_envs=2, subproc=False, wrap=None, **kwargs):
         options: dict[str, Any] = {}
         if subproc:
             # Python 3.13 cannot fork a process in which tests of Ray ran, but a new one, which would need a server of its own
-            start_method = "forkserver" if multiprocessing.parent_process() is None else "fork"
-            options = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method=start_method), wrapper_class=ResumableEnv)
+            start = {"start_method": "forkserver" if multiprocessing.parent_process() is None else "fork"}
+            options = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=start, wrapper_class=ResumableEnv)
         if str(env_id).startswith("Continual/"):
             kwargs.setdefault("n_envs", n_envs)
         env = make_vec_env(env_id, n_envs, seed=seed, env_kwargs=kwargs, **options)
