@@ -50,7 +50,7 @@ def collapses(results: Sequence[Result]) -> tuple[int, int]:
     :return: Tasks after a switch at whose end the policy has collapsed, and tasks after a switch
     """
     ends = [
-        result.returns_in_task(task)[1][-10:].mean() < COLLAPSED[result.env_id]
+        bool(result.returns_in_task(task)[1][-10:].mean() < COLLAPSED[result.env_id])
         for result in results
         for task in range(1, result.n_tasks)
     ]

@@ -1,5 +1,6 @@
 import multiprocessing
 import signal
+from contextlib import suppress
 
 import pytest
 import torch as th
@@ -8,6 +9,10 @@ import torch as th
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Here, because only processes that are started later have them imported
 multiprocessing.set_forkserver_preload(["tests.resume_preload"])
+
+
+with suppress(ImportError):  # before dm_control, which tests import; see sb3_cchain/envs/dm_control.py
+    import triton  # noqa: F401
 
 
 @pytest.fixture(autouse=True)

@@ -195,7 +195,8 @@ def test_flattening_refuses_other_environments():
         FlatDMControl(RandomEnv())
 
 
-def test_without_the_packages():
+def test_without_the_packages(tmp_path):
+    (tmp_path / "triton.py").touch()  # is to be imported before dm_control
     # In a process of its own, which has not imported them yet
     code = """
 import sys
@@ -210,9 +211,11 @@ for package in packages:
         assert 'pip install "sb3-cchain[dmc]"' in str(error) and "3.13" in str(error), error
     else:
         sys.exit(f"no error without {package}")
+    assert "triton" in sys.modules
     del sys.modules[package]
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": path})
 
 
 @needs_dm_control

@@ -4,6 +4,7 @@ import shutil
 from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,8 @@ def write_snapshots(matrices: dict[int, np.ndarray], path: Path) -> None:
     :param path: File
     """
     with write_safely(path) as unfinished, open(unfinished, "wb") as file:
-        np.savez_compressed(file, **{str(steps): matrix for steps, matrix in matrices.items()})
+        arrays: dict[str, Any] = {str(steps): matrix for steps, matrix in matrices.items()}
+        np.savez_compressed(file, **arrays)
 
 
 def read_snapshots(result: Result) -> dict[int, np.ndarray]:

@@ -155,7 +155,7 @@ class ContinualMetrics(BaseCallback):
         self._rollout_steps += len(infos)
 
     def _count_episodes(self, infos: list[dict[str, Any]], dones: NDArray[np.bool_]) -> None:
-        state, ended = self._state, np.flatnonzero(dones)
+        state, ended = self._state, np.flatnonzero(dones).tolist()
         began = first_reset_info(self.training_env)
         # An environment that numbers its tasks may end them by cutting the episodes. A switch by the word of another cuts none
         was_cut = TASK_KEY in began and TaskSwitch(infos[0].get(TASK_KEY)).happened(began[TASK_KEY])

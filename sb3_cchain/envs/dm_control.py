@@ -1,6 +1,7 @@
 """Continual DeepMind Control: a chain of tasks of one robot."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any, SupportsFloat
 
@@ -111,6 +112,10 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating[A
 
 
 def _known_tasks() -> Mapping[str, Sequence[str]]:
+    with suppress(ImportError):
+        # PyTorch for CUDA imports Triton at the first update. After dm_control that can be a segmentation fault: to render it
+        # loads Mesa, which brings an LLVM of another version. The other way round nothing happens
+        import triton  # noqa: F401
     try:
         # Shimmy registers the environments when it is imported, those of dm_control only where that is installed
         import dm_control.suite

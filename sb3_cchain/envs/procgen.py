@@ -5,7 +5,8 @@ import sys
 from collections.abc import Sequence
 from copy import deepcopy
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,9 +15,6 @@ from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_number
-
-if TYPE_CHECKING:
-    from procgen import ProcgenGym3Env
 
 # Pixels of a frame per pixel of an observation and direction
 FRAME_SCALE = 8
@@ -113,18 +111,18 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
             "distribution_mode": distribution_mode,
         }
         # Begun at the first reset, so that tasks far ahead cost nothing
-        self._game: ProcgenGym3Env | None = None
+        self._game: Any = None
         # The first observation of an episode that procgen has begun and reset() has not
         self._next_observation: NDArray[np.uint8] | None = None
         # The last observation that was returned
         self._observation: NDArray[np.uint8] | None = None
 
-    def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> "ProcgenGym3Env":
+    def launch(self, n_games: int, rand_seed: int, **kwargs: Any) -> Any:
         """
         :param n_games: How many games are to run side by side
         :param rand_seed: From 0 to 2³¹ - 1
         :param kwargs: Further arguments of ``ProcgenGym3Env``
-        :return: Procgen itself, with this game's settings; to be closed by the caller
+        :return: Procgen itself (``ProcgenGym3Env``), with this game's settings; to be closed by the caller
         """
         # cffi looks up the functions of procgen under a lock that one thread cannot take twice. If the garbage collector ran
         # then and closed a game that nobody had closed, this would wait for ever. So it does not run while a game is made, and
@@ -132,7 +130,7 @@ class ProcgenGame(gym.Env[NDArray[np.uint8], np.int64]):
         enabled = gc.isenabled()
         gc.disable()
         try:
-            game: Any = _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
+            game = _import_procgen()(num=n_games, rand_seed=rand_seed, **self._settings, **kwargs)
             _ = game._c_lib.libenv_close
         finally:
             if enabled:
@@ -299,12 +297,11 @@ def _check_game(game: str, distribution_mode: str) -> None:
         raise ValueError(f"`distribution_mode` must be one of {', '.join(modes)} for {game}, got {distribution_mode!r}")
 
 
-def _import_procgen() -> "type[ProcgenGym3Env]":
+def _import_procgen() -> Any:
     try:
-        from procgen import ProcgenGym3Env
+        return import_module("procgen").ProcgenGym3Env
     except ImportError as error:
         advice = 'procgen is not installed: pip install "sb3-cchain[procgen]"'
         if sys.version_info >= (3, 13):
             advice += ". There is no wheel of it for Python 3.13 or later: use Python 3.10, 3.11 or 3.12"
         raise ImportError(advice) from error
-    return ProcgenGym3Env

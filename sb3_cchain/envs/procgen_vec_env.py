@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,9 +14,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_cchain.envs.procgen import N_ACTIONS, NEW_EPISODE, ContinualProcgen, ProcgenGame
 from sb3_cchain.validation import check_number
-
-if TYPE_CHECKING:
-    from procgen import ProcgenGym3Env
 
 
 class ContinualProcgenVecEnv(VecEnv):
@@ -45,7 +42,7 @@ class ContinualProcgenVecEnv(VecEnv):
         self._sequence = ContinualProcgen(game, n_envs=n_envs, render_mode=render_mode, **kwargs)
         super().__init__(int(n_envs), self._sequence.observation_space, self._sequence.action_space)
         self._num_threads = int(num_threads)
-        self._games: ProcgenGym3Env | None = None
+        self._games: Any = None
         self._rng: np.random.Generator | None = None
         self._observations = np.zeros((self.num_envs, *self.observation_space.shape), dtype=np.uint8)  # type: ignore[misc]
         self._returns = np.zeros(self.num_envs)
@@ -78,7 +75,7 @@ class ContinualProcgenVecEnv(VecEnv):
         self._games = self._make_games(int(self._rng.integers(2**31)))
         self._observations = self._games.observe()[1]["rgb"]
 
-    def _make_games(self, rand_seed: int) -> "ProcgenGym3Env":
+    def _make_games(self, rand_seed: int) -> Any:
         task = self._sequence.task
         assert isinstance(task, ProcgenGame)
         return task.launch(self.num_envs, rand_seed, num_threads=self._num_threads)

@@ -87,7 +87,7 @@ class CommonSpaces(gym.Wrapper, RecordConstructorArgs):
 
     def _padded(self, observation: Any) -> NDArray[np.float32]:
         padded = np.zeros(self._size, dtype=np.float32)
-        flat = spaces.flatten(self._inner_observations, observation)
+        flat: Any = spaces.flatten(self._inner_observations, observation)
         padded[: len(flat)] = flat
         return padded
 
