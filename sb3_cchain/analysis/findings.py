@@ -79,7 +79,7 @@ CHECKS = (
         "How much its actions differ over the observations that it met, noise included: 0 where it always takes the same one, "
         "1 where it takes all equally often. Such an agent no longer reacts to what it sees, and collects data of one kind.",
         OWN,
-        (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.SMALLER_RATE, r.CCHAIN, r.LAYER_RESET),
+        (r.ENTROPY_BONUS, r.ENTROPY_TARGET, r.EPSILON, r.SMALLER_RATE, r.CCHAIN, r.LAYER_NORM, r.FIRE),
     ),
     Check(
         *("no_exploration", "The agent does not explore", "exploration", "below", 0.005, "possible"),

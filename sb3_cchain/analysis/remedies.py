@@ -166,6 +166,9 @@ LAYER_RESET = Remedy(
     (*PLAIN_ON_POLICY, "DQN"),
     method="layer_reset",
 )
+FIRE = Remedy(
+    "FIRE, which makes the weights orthogonal", _callback("FIRE", "interval=40_000"), (*PLAIN_ON_POLICY, "DQN"), method="fire"
+)
 CCHAIN = Remedy("churn reduction", _callback("CChainCallback", package="sb3_cchain"), method="cchain")
 LAYER_NORM = Remedy(
     "LayerNorm",
