@@ -162,7 +162,6 @@ SUITES = {
 }
 
 
-@cache
 def check_env_id(suite: str, env_id: str) -> None:
     """
     :param suite: Name of a suite
@@ -173,6 +172,7 @@ def check_env_id(suite: str, env_id: str) -> None:
         raise ValueError(f"`env_id` must be one of {', '.join(SUITES[suite].env_ids)}; got {env_id}")
 
 
+@cache
 def paper_length(env_id: str) -> tuple[int, int]:
     """
     :param env_id: Environment id
