@@ -16,12 +16,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_cchain import CChainPPO
 from sb3_cchain.envs import ContinualDMControl, FlatDMControl, TaskVecNormalize
 from tests.envs import RandomEnv
-from tests.extras import needs_dm_control
+from tests.extras import NO_WHEELS, needs_dm_control
 
-try:
+if not NO_WHEELS:
     from dm_control import suite
-except ModuleNotFoundError:
-    suite = None
 
 SEQUENCES = {
     "Walker": ("walker", ["stand", "walk", "run"], 24, 6),

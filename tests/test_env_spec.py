@@ -1,7 +1,6 @@
 """Gymnasium's specs: environments of this package can be described, sent elsewhere and made again; `make_vec` makes them."""
 
 import pickle
-import sys
 
 import gymnasium as gym
 import minatar.gym
@@ -23,10 +22,10 @@ from sb3_cchain.envs import (
 )
 from sb3_cchain.envs.registration import CONTINUAL_ENVS, OTHER_ENVS
 from tests.envs import RandomEnv
+from tests.extras import NO_WHEELS
 
 ALL_ENVS = CONTINUAL_ENVS | OTHER_ENVS
 # The entries of a suite differ in their arguments alone
-NO_WHEELS = ("dm_control", "procgen") if sys.version_info >= (3, 13) else ()
 ONE_OF_A_SUITE = list(
     {
         entry["entry_point"]: f"Continual/{name}"

@@ -1,7 +1,6 @@
 """The YAML files, and which of them the command line takes."""
 
 import ast
-import sys
 from collections import OrderedDict
 
 import pytest
@@ -14,6 +13,7 @@ from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.envs.registration import CONTINUAL_ENVS, OTHER_ENVS
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
+from tests.extras import NO_WHEELS
 from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, command, shipped_settings
 
 # Algorithms of which RL Zoo has no settings
@@ -72,7 +72,7 @@ ROLLOUTS = {
 @pytest.mark.parametrize("algo, env_id", ROLLOUTS)
 @pytest.mark.filterwarnings("ignore")
 def test_every_environment_trains_a_rollout_with_its_settings(tmp_path, algo, env_id):
-    if sys.version_info >= (3, 13) and env_id in PROCGEN + DMC:
+    if NO_WHEELS and env_id in PROCGEN + DMC:
         pytest.skip("no wheels")
     changed = ROLLOUTS[algo, env_id]
     n_steps = next((change.split(":")[1] for change in changed if "n_steps" in change), "800")
@@ -260,7 +260,7 @@ ROW_SUITES = [
 @pytest.mark.parametrize("method, suite", ROW_SUITES)
 @pytest.mark.filterwarnings("ignore")
 def test_every_method_trains_a_rollout_of_two_tasks_with_its_settings(tmp_path, method, suite):
-    if sys.version_info >= (3, 13) and suite in ("procgen", "dmc"):
+    if NO_WHEELS and suite in ("procgen", "dmc"):
         pytest.skip("no wheels")
     env_id, n_steps, batch_size = METHOD_ROLLOUTS[suite]
     short = [f"n_steps:{n_steps}", f"batch_size:{batch_size}", "n_epochs:1"]
