@@ -197,7 +197,12 @@ CASES = {
         "Continual symbols with invalid actions, MaskablePPO",
         "rollouts of 512 steps, a learning rate of 1e-3, SB3's settings otherwise",
         continual_masked_symbols,
-        {"maskable_ppo": Variant("MaskablePPO", MaskablePPO), "cchain": Variant("C-CHAIN MaskablePPO", CChainMaskablePPO)},
+        {
+            "maskable_ppo": Variant("MaskablePPO", MaskablePPO),
+            "cchain": Variant("C-CHAIN MaskablePPO, β 1e4 (default)", CChainMaskablePPO),
+            "cchain_1e3": Variant("C-CHAIN MaskablePPO, β 1e3", CChainMaskablePPO, {"target_churn_ratio": 1e3}),
+            "cchain_1e2": Variant("C-CHAIN MaskablePPO, β 1e2", CChainMaskablePPO, {"target_churn_ratio": 1e2}),
+        },
         steps=120_000,
         eval_freq=3000,
         seeds=3,
