@@ -10,7 +10,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.family import __main__ as command
 from benchmarks.family import training
-from benchmarks.family.cases import CASES, Case, Variant
+from benchmarks.family.betas import BETAS
+from benchmarks.family.case import Case, Variant
+from benchmarks.family.cases import CASES
 from benchmarks.family.masked_symbols import continual_masked_symbols
 from benchmarks.family.tables import case_table, falls, falls_table, number, read_all, summary_table
 from benchmarks.family.training import runs_of, train, train_all
@@ -37,6 +39,7 @@ def small(monkeypatch):
     monkeypatch.setattr("benchmarks.family.cases.CASES", {"small": SMALL})
     for module in (training, command):
         monkeypatch.setattr(module, "CASES", {"small": SMALL})
+    monkeypatch.setattr(command, "EVIDENCE", {"small": SMALL})
 
 
 @pytest.fixture
@@ -64,6 +67,26 @@ def test_a_table_of_the_seeds(runs):
     assert table.endswith("Seeds that are not done yet: C-CHAIN: 1.")
     write(runs[3], [0] * 8)
     assert "not done" not in case_table(SMALL, read_all(runs))
+
+
+def test_churn_is_shown_as_a_share_of_the_base(runs, monkeypatch):
+    case = replace(SMALL, monitor={})
+    monkeypatch.setattr(training, "CASES", {"small": case})
+    # No update before the first evaluation
+    for run, (policy, values) in zip(runs, [(1.0, 40.0), (0.5, 10.0), (3.0, 40.0)], strict=False):
+        write(run, ["0,,", *[f"0,{policy},{values}"] * 7], "mean_return,policy_churn,value_churn")
+    _, _, base, cchain = rows(case_table(case, read_all(runs)))
+    # 0.5 of a mean of 2, 10 of 40
+    assert base[-2:] == ["1.00", "1.00"] and cchain[-2:] == ["0.25", "0.25"]
+
+
+def test_churn_is_measured(runs, monkeypatch):
+    monkeypatch.setattr(training, "CASES", {"small": replace(SMALL, monitor={"interval": 2, "batch_size": 4})})
+    lines = train(runs[0]).result.read_text().splitlines()
+    assert lines[0] == "timesteps,mean_return,policy_churn,value_churn" and len(lines) == 9
+    (evaluations,) = read_all(runs)["ppo"].values()
+    # Of eight evaluations the first is after step 5, when a rollout of 4 steps has been learned from
+    assert evaluations.shape == (8, 4) and (evaluations[:, 2:] > 0).all()
 
 
 def test_a_difference_is_bold_when_its_interval_leaves_out_0(runs):
@@ -187,6 +210,14 @@ def test_evaluations_divide_a_case(name):
         assert case.env_kwargs["steps_per_task"] * case.n_tasks == case.steps
     base, *others = case.variants
     assert not base.startswith("cchain") and any(name.startswith("cchain") for name in others)
+
+
+@pytest.mark.parametrize("name", BETAS)
+def test_the_default_is_among_the_betas(name):
+    labels = [variant.label for variant in BETAS[name].variants.values()]
+    for target in ("policy", "value"):
+        of_target = [label for label in labels if label.startswith(target)]
+        assert len([label for label in of_target if "(default)" in label]) == bool(of_target)
 
 
 def test_masks_of_the_present_task():

@@ -5,6 +5,7 @@ them as they go, and makes tables and pictures. Runs that are done are not made 
     python -m benchmarks.family                                             # the cases, and how many of their runs are done
     python -m benchmarks.family --case her_bit_flipping dqn_cartpole        # makes their missing runs, prints their tables
     python -m benchmarks.family --case ppo_cartpole --variant ppo --seeds 0 1
+    python -m benchmarks.family --case a2c_betas sac_betas                  # several β, from which the defaults come
     python -m benchmarks.family --write                                     # trains nothing; all tables and pictures
 """
 
@@ -12,7 +13,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.family.cases import CASES
+from benchmarks.family.cases import CASES, EVIDENCE
 from benchmarks.family.picture import plot
 from benchmarks.family.tables import about, case_table, falls_table, read_all, summary_table
 from benchmarks.family.training import runs_of, train_all
@@ -62,12 +63,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in args.case or CASES:
             case, evaluations = results[name]
             parts = [about(case), tables[f"family_{name}"]]
-            if any(evaluations.values()):
+            if name in EVIDENCE and any(evaluations.values()):
                 picture = f"images/family/{name}.png"
                 plot(case, evaluations, args.docs / picture)
                 parts.append(f"![Learning curves: {case.title}](../{picture})")
             tables[f"family_{name}"] = "\n\n".join(parts)
-        write_tables({**tables, "family_evidence": summary_table(results)}, args.docs)
+        evidence = {name: result for name, result in results.items() if name in EVIDENCE}
+        write_tables({**tables, "family_evidence": summary_table(evidence)}, args.docs)
 
 
 def _check(parser: argparse.ArgumentParser, option: str, asked: Sequence[Any] | None, known: Sequence[Any]) -> None:

@@ -1,79 +1,19 @@
-"""What is compared: one row for each case."""
+"""What is compared: one row for each case. Those from which the default β come are in ``betas``."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC, TD3, HerReplayBuffer
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
+from benchmarks.family.betas import BETAS
+from benchmarks.family.case import Case, Variant
 from benchmarks.family.masked_symbols import continual_masked_symbols
 from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.algorithms.contrib import CChainMaskablePPO, CChainQRDQN, CChainRecurrentPPO
-
-
-@dataclass(frozen=True)
-class Variant:
-    """
-    An algorithm in a case.
-
-    :param label: Human-readable name
-    :param algorithm: Its class
-    :param arguments: Arguments beside the settings of the case
-    """
-
-    label: str
-    algorithm: type[BaseAlgorithm]
-    arguments: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Case:
-    """
-    A comparison.
-
-    :param title: Environment and algorithm, human-readable
-    :param source: Where the settings come from
-    :param env: Environment id, or what makes the environment
-    :param variants: What is compared, by the name of the files of results. C-CHAIN is compared with the first one
-    :param steps: Environment steps of a run
-    :param eval_freq: Environment steps between two evaluations
-    :param seeds: Number of seeds
-    :param settings: Arguments of all variants
-    :param env_kwargs: Arguments of the environment
-    :param n_envs: Environments side by side
-    :param n_eval_episodes: Episodes of an evaluation, on the task being trained
-    :param n_tasks: Tasks of equal length, one after the other
-    :param normalize: Whether ``VecNormalize`` normalises observations and rewards
-    :param policy: Policy
-    :param score: Column of the results that is compared
-    :param solved: Mean return that counts as solved, where the case asks whether what was learned stays
-    :param worst: Return of an agent that can do nothing, there
-    """
-
-    title: str
-    source: str
-    env: str | Callable[..., gym.Env]
-    variants: Mapping[str, Variant]
-    steps: int
-    eval_freq: int
-    seeds: int = 5
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    n_envs: int = 1
-    n_eval_episodes: int = 10
-    n_tasks: int = 1
-    normalize: bool = False
-    policy: str = "MlpPolicy"
-    score: str = "mean_return"
-    solved: float | None = None
-    worst: float = 0.0
 
 
 def _noise(n_actions: int) -> NormalActionNoise:
@@ -108,7 +48,8 @@ _CARTPOLE_DQN: dict[str, Any] = {
 _CHAIN: dict[str, Any] = {"learning_starts": 5000, "buffer_size": 150_000}
 _CHAIN_TD3: dict[str, Any] = {**_CHAIN, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}}
 
-CASES = {
+# Does it help or harm?
+EVIDENCE = {
     "her_bit_flipping": Case(
         "Bit flipping with hindsight experience replay, DQN",
         "SB3's own test of HerReplayBuffer",
@@ -286,3 +227,5 @@ CASES = {
         n_tasks=2,
     ),
 }
+
+CASES = {**EVIDENCE, **BETAS}

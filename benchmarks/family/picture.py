@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.family.cases import Case
+from benchmarks.family.case import Case
 from benchmarks.family.tables import Evaluations
 from sb3_cchain.analysis.plots import import_matplotlib
 
-# By position: the base algorithm, C-CHAIN with its defaults, another
-COLORS = ("tab:gray", "tab:blue", "tab:orange")
+# By position: the base algorithm, C-CHAIN with its defaults, others
+COLORS = ("tab:gray", "tab:blue", "tab:orange", "tab:green")
 
 
 def plot(case: Case, evaluations: Evaluations, path: Path) -> None:

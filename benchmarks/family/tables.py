@@ -7,7 +7,7 @@ from textwrap import fill
 import numpy as np
 from scipy.stats import ttest_ind
 
-from benchmarks.family.cases import Case
+from benchmarks.family.case import Case
 from benchmarks.family.training import Run, read
 from benchmarks.report.markdown import markdown_table
 from benchmarks.speed.tables import LINE_LENGTH
@@ -110,9 +110,24 @@ def case_table(case: Case, evaluations: Evaluations) -> str:
         for measure in MEASURES.values():
             scores = [measure(case, seeds[seed]) for seed in sorted(seeds)]
             row += [", ".join(map(number, scores)), number(fmean(scores)) if scores else ""]
+        if case.monitor is not None:
+            row += _churn_shares(evaluations, name)
         rows.append(row)
     header = ["", *(cell for name in MEASURES for cell in (f"{name}, by seed", "mean"))]
+    if case.monitor is not None:
+        header += ["churn of the policy", "churn of the values"]
     return _with_missing(markdown_table(header, rows), case, evaluations)
+
+
+def _churn_shares(evaluations: Evaluations, name: str) -> list[str]:
+    """Mean churn of a variant, of the policy and of the values, as shares of the first variant's."""
+    base = next(iter(evaluations))
+    if not evaluations[name] or not evaluations[base]:
+        return ["", ""]
+    churn, churn_of_base = (
+        np.nanmean([each[:, 2:] for each in evaluations[key].values()], axis=(0, 1)) for key in (name, base)
+    )
+    return [number(share) for share in churn / churn_of_base]
 
 
 def _with_missing(table: str, case: Case, evaluations: Evaluations) -> str:

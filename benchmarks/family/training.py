@@ -17,11 +17,16 @@ from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from benchmarks.family.cases import CASES, Case, Variant
-from sb3_cchain import TaskSync, TrainingCheckpoint, resume
+from benchmarks.family.case import Case, Variant
+from benchmarks.family.cases import CASES
+from sb3_cchain import ChurnMonitor, TaskSync, TrainingCheckpoint, resume
 from sb3_cchain.checkpoint import has_checkpoint, write_safely
+
+# What `ChurnMonitor` measures
+CHURN = ("policy_churn", "value_churn")
 
 
 @dataclass(frozen=True)
@@ -111,13 +116,17 @@ def train(run: Run) -> Run:
     callbacks: list[BaseCallback] = [evaluation, TrainingCheckpoint(max(case.steps // 10, 1), run.checkpoints, keep=1)]
     if case.n_tasks > 1:
         callbacks.insert(0, TaskSync())
+    if case.monitor is not None:
+        callbacks.append(ChurnMonitor(**case.monitor))
     env = _make_env(case, case.n_envs)
     if has_checkpoint(run.checkpoints):
         resume(run.checkpoints, env, callbacks, device="cpu")
     else:
         settings = deepcopy({**case.settings, **variant.arguments})  # algorithms may write into `policy_kwargs`
         model = variant.algorithm(case.policy, env, seed=run.seed, device="cpu", **settings)
-        model.learn(case.steps, callbacks)
+        # One line of the log per evaluation, with the churn since the one before
+        model.set_logger(configure(str(run.checkpoints / "log"), ["csv"]))
+        model.learn(case.steps, callbacks, log_interval=None)  # type: ignore[arg-type]  # SB3 takes None, too
     _write(run, evaluation)
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return run
@@ -151,6 +160,11 @@ def _write(run: Run, evaluation: EvalCallback) -> None:
     }
     if run.case.score == "success_rate":
         columns["success_rate"] = np.mean(evaluation.evaluations_successes, axis=1).tolist()
+    if run.case.monitor is not None:
+        with open(run.checkpoints / "log" / "progress.csv", newline="") as file:
+            logged = list(csv.DictReader(file))
+        for name in CHURN:
+            columns[name] = [row.get(f"churn_monitor/fixed/{name}", "") for row in logged]
     run.result.parent.mkdir(parents=True, exist_ok=True)
     with write_safely(run.result) as path, open(path, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -162,15 +176,17 @@ def _write(run: Run, evaluation: EvalCallback) -> None:
 def read(run: Run) -> np.ndarray:
     """
     :param run: A run that is done
-    :return: Its evaluations: environment steps and score, ``(n_evaluations, 2)``
+    :return: Its evaluations: environment steps and score, ``(n_evaluations, 2)``. Where churn is measured, that of the policy
+        and of the values since the evaluation before are two more columns, NaN where there was no update.
     :raises ValueError: When the file has other columns, or not the length of the case
     """
     with open(run.result, newline="") as file:
         rows = list(csv.DictReader(file))
+    columns = ["timesteps", run.case.score, *(() if run.case.monitor is None else CHURN)]
     try:
-        evaluations = np.array([[float(row[name]) for name in ("timesteps", run.case.score)] for row in rows])
+        evaluations = np.array([[float(row[name] or "nan") for name in columns] for row in rows])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{run.result} must have the columns timesteps and {run.case.score}: {error!r}") from error
+        raise ValueError(f"{run.result} must have the columns {' and '.join(columns)}: {error!r}") from error
     expected = run.case.steps // run.case.eval_freq
     if len(evaluations) != expected:
         raise ValueError(
