@@ -3,6 +3,7 @@
 import pytest
 import torch as th
 from gymnasium.wrappers import TimeLimit
+from sb3_contrib import ARS
 from stable_baselines3 import DQN, PPO
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
@@ -46,3 +47,8 @@ def test_off_policy():
     model = DQN("MlpPolicy", TimeLimit(Ones(), 5), learning_starts=100, buffer_size=20, device="cpu")
     model.learn(16, callback=NoBootstrapAtCuts())
     assert not model.replay_buffer.timeouts.any() and model.replay_buffer.dones[:16].sum() == 3
+
+
+def test_an_algorithm_that_does_not_bootstrap_is_refused():
+    with pytest.raises(TypeError, match="NoBootstrapAtCuts is for algorithms that bootstrap, got ARS"):
+        ARS("MlpPolicy", "CartPole-v1", device="cpu").learn(10, callback=NoBootstrapAtCuts())

@@ -1,6 +1,8 @@
 """Episodes that are cut count as ended."""
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 
 class NoBootstrapAtCuts(BaseCallback):
@@ -10,7 +12,13 @@ class NoBootstrapAtCuts(BaseCallback):
     cut after 1000 steps.
 
     Give it as the last of the callbacks, because it changes what the others are told (``TimeLimit.truncated``).
+
+    :raises TypeError: When training starts, for an algorithm that does not bootstrap: ARS
     """
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+            raise TypeError(f"NoBootstrapAtCuts is for algorithms that bootstrap, got {type(self.model).__name__}")
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
