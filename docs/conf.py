@@ -75,6 +75,7 @@ CONTENTS = {
         "DeepMind Control <results/dm_control>",
         "MinAtar <results/minatar>",
         "Other algorithms <results/family>",
+        "The default β <results/betas>",
         "Supervised learning <results/supervised>",
         "Reference batches <results/references>",
         "β and size of the reference batch <results/sensitivity>",
