@@ -103,6 +103,13 @@ def test_a_difference_is_bold_when_its_interval_leaves_out_0(runs):
     assert difference.startswith("1.00 (-") and " to " in difference
 
 
+def test_a_difference_is_of_the_same_seeds(runs):
+    for run, score in zip(runs, [1.0, 2.0, 100.0], strict=False):
+        write(run, [score] * 8)
+    ((_, _, seeds, means, difference, *_),) = rows(summary_table({"small": (SMALL, read_all(runs))}))[2:]
+    assert (seeds, means, difference) == ("1", "1.00 → 2.00", "1.00")
+
+
 def test_tables_without_runs(runs):
     evaluations = read_all(runs)
     assert summary_table({"small": (SMALL, evaluations)}).endswith("Not done yet: Continual CartPole (C-CHAIN).")

@@ -59,7 +59,8 @@ MEASURES = {"over training": over_training, "at the end": at_the_end}
 def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
     """
     :param cases: Cases and their results, by name
-    :return: A table with a row for each C-CHAIN variant, against the first variant of its case, and what is missing
+    :return: A table with a row for each C-CHAIN variant, against the first variant of its case, over the seeds that both have,
+        and what is missing
     """
     rows = []
     missing: dict[str, list[str]] = {}
@@ -68,15 +69,15 @@ def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
         for name in others:
             if not name.startswith("cchain"):
                 continue
-            label, seeds = case.variants[name].label, [len(evaluations[base]), len(evaluations[name])]
-            if min(seeds) == 0:
+            label, seeds = case.variants[name].label, sorted(evaluations[base].keys() & evaluations[name].keys())
+            if not seeds:
                 missing.setdefault(case.title, []).append(label)
                 continue
             cells: list[str] = []
             for measure in MEASURES.values():
-                before, after = ([measure(case, each) for each in evaluations[key].values()] for key in (base, name))
+                before, after = ([measure(case, evaluations[key][seed]) for seed in seeds] for key in (base, name))
                 cells += _compared(before, after)
-            rows.append([case.title, label, ", ".join(map(str, dict.fromkeys(seeds))), *cells])
+            rows.append([case.title, label, str(len(seeds)), *cells])
     header = ["", "", "seeds", *(cell for name in MEASURES for cell in (name, "difference"))]
     table = markdown_table(header, rows)
     if not missing:
