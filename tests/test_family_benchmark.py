@@ -152,10 +152,12 @@ def test_a_result_of_another_case_is_refused(runs, scores, column, message):
         read_all(runs)
 
 
-def test_a_run_goes_on_where_it_was(runs, monkeypatch):
+@pytest.mark.parametrize("monitor", [None, {"interval": 2, "batch_size": 4}])
+def test_a_run_goes_on_where_it_was(runs, monkeypatch, monitor):
+    monkeypatch.setattr(training, "CASES", {"small": replace(SMALL, monitor=monitor)})
     run = runs[1]
     expected = train(run).result.read_text()
-    assert expected.splitlines()[0] == "timesteps,mean_return" and len(expected.splitlines()) == 9
+    assert expected.startswith("timesteps,mean_return") and len(expected.splitlines()) == 9
     assert not run.checkpoints.exists()
     run.result.unlink()
 

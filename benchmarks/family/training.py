@@ -17,7 +17,6 @@ from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.family.case import Case, Variant
@@ -113,21 +112,22 @@ def train(run: Run) -> Run:
     th.set_num_threads(1)
     case, variant = run.case, run.variant
     evaluation = _evaluation(run)
+    churn_log = ChurnLog(evaluation.eval_freq)
     callbacks: list[BaseCallback] = [evaluation, TrainingCheckpoint(max(case.steps // 10, 1), run.checkpoints, keep=1)]
     if case.n_tasks > 1:
         callbacks.insert(0, TaskSync())
     if case.monitor is not None:
-        callbacks.append(ChurnMonitor(**case.monitor))
+        # Before the evaluation, which writes the log and empties it
+        callbacks = [ChurnMonitor(**case.monitor), churn_log, *callbacks]
     env = _make_env(case, case.n_envs)
     if has_checkpoint(run.checkpoints):
         resume(run.checkpoints, env, callbacks, device="cpu")
     else:
         settings = deepcopy({**case.settings, **variant.arguments})  # algorithms may write into `policy_kwargs`
         model = variant.algorithm(case.policy, env, seed=run.seed, device="cpu", **settings)
-        # One line of the log per evaluation, with the churn since the one before
-        model.set_logger(configure(str(run.checkpoints / "log"), ["csv"]))
+        # Nobody but the evaluation may empty the log, which holds the churn
         model.learn(case.steps, callbacks, log_interval=None)  # type: ignore[arg-type]  # SB3 takes None, too
-    _write(run, evaluation)
+    _write(run, evaluation, churn_log)
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return run
 
@@ -153,7 +153,26 @@ def _evaluation(run: Run) -> EvalCallback:
     )
 
 
-def _write(run: Run, evaluation: EvalCallback) -> None:
+class ChurnLog(BaseCallback):
+    """
+    Keeps what ``ChurnMonitor`` logged since the evaluation before.
+
+    :param eval_freq: As of ``EvalCallback``
+    """
+
+    def __init__(self, eval_freq: int):
+        super().__init__()
+        self.eval_freq = eval_freq
+        self.churn: dict[str, list[float | str]] = {name: [] for name in CHURN}
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.eval_freq == 0:
+            for name, values in self.churn.items():
+                values.append(self.logger.name_to_value.get(f"churn_monitor/fixed/{name}", ""))
+        return True
+
+
+def _write(run: Run, evaluation: EvalCallback, churn_log: ChurnLog) -> None:
     columns = {
         "timesteps": evaluation.evaluations_timesteps,
         "mean_return": np.mean(evaluation.evaluations_results, axis=1).tolist(),
@@ -161,10 +180,7 @@ def _write(run: Run, evaluation: EvalCallback) -> None:
     if run.case.score == "success_rate":
         columns["success_rate"] = np.mean(evaluation.evaluations_successes, axis=1).tolist()
     if run.case.monitor is not None:
-        with open(run.checkpoints / "log" / "progress.csv", newline="") as file:
-            logged = list(csv.DictReader(file))
-        for name in CHURN:
-            columns[name] = [row.get(f"churn_monitor/fixed/{name}", "") for row in logged]
+        columns.update(churn_log.churn)
     run.result.parent.mkdir(parents=True, exist_ok=True)
     with write_safely(run.result) as path, open(path, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
