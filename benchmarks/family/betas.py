@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch as th
 from sb3_contrib import TQC, TRPO, CrossQ
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.noise import NormalActionNoise
 
-from benchmarks.family.case import Case, Variant
+from benchmarks.family.case import Case, Variant, action_noise
 from sb3_cchain import CChainA2C, CChainPPO, CChainSAC, CChainTD3
 from sb3_cchain.algorithms.churn_targets import churn_kind
 from sb3_cchain.algorithms.contrib import CChainCrossQ, CChainTQC, CChainTRPO
@@ -33,10 +31,10 @@ def _variants(base: type[BaseAlgorithm], cchain: type[BaseAlgorithm], **betas: s
     return variants
 
 
-def _cartpole(algorithm: str, variants: Mapping[str, Variant], source: str, **settings: Any) -> Case:
+def _cartpole(algorithm: str, variants: Mapping[str, Variant], source: str = "", **settings: Any) -> Case:
     return Case(
         f"β of {algorithm}, CartPole",
-        source,
+        f"8 environments, {source}SB3's settings otherwise",
         "CartPole-v1",
         variants,
         steps=40_000,
@@ -48,10 +46,10 @@ def _cartpole(algorithm: str, variants: Mapping[str, Variant], source: str, **se
     )
 
 
-def _pendulum(algorithm: str, variants: Mapping[str, Variant], source: str, **settings: Any) -> Case:
+def _pendulum(algorithm: str, variants: Mapping[str, Variant], source: str = "", **settings: Any) -> Case:
     return Case(
         f"β of {algorithm}, Pendulum",
-        f"two layers of 64, a learning rate of 1e-3, {source}",
+        f"two layers of 64, a learning rate of 1e-3, {source}SB3's settings otherwise",
         "Pendulum-v1",
         variants,
         steps=10_000,
@@ -62,6 +60,7 @@ def _pendulum(algorithm: str, variants: Mapping[str, Variant], source: str, **se
     )
 
 
+_ROLLOUTS = {"n_steps": 128, "batch_size": 128}
 _ADAM = {"policy_kwargs": {"optimizer_class": th.optim.Adam}}
 
 BETAS = {
@@ -74,37 +73,31 @@ BETAS = {
                 "with Adam, value, β 0.01", CChainA2C, {**_ADAM, "churn_target": "value", "target_churn_ratio": 0.01}
             ),
         },
-        "8 environments, SB3's settings otherwise",
     ),
     "ppo_value_betas": _cartpole(
         "PPO's values",
         _variants(PPO, CChainPPO, value="1e-4 1e-3 0.01 0.1"),
-        "8 environments, rollouts of 128 steps each, minibatches of 128, 8 epochs, SB3's settings otherwise",
-        n_steps=128,
-        batch_size=128,
+        "rollouts of 128 steps each, minibatches of 128, 8 epochs, ",
+        **_ROLLOUTS,
         n_epochs=8,
     ),
     "trpo_betas": _cartpole(
         "TRPO",
         _variants(TRPO, CChainTRPO, value="1e-4 1e-3 0.01"),
-        "8 environments, rollouts of 128 steps each, minibatches of 128, SB3's settings otherwise",
-        n_steps=128,
-        batch_size=128,
+        "rollouts of 128 steps each, minibatches of 128, ",
+        **_ROLLOUTS,
     ),
     "sac_betas": _pendulum(
         "SAC",
         _variants(SAC, CChainSAC, policy="5e-6 5e-5 5e-4", value="1e-4 1e-3 0.01"),
-        "SB3's settings otherwise",
     ),
     "td3_betas": _pendulum(
         "TD3",
         _variants(TD3, CChainTD3, policy="5e-6 5e-5 5e-4", value="1e-4 1e-3 0.01"),
-        "noise of 0.1 and a γ of 0.98, SB3's settings otherwise",
+        "noise of 0.1 and a γ of 0.98, ",
         gamma=0.98,
-        action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.1)),
+        action_noise=action_noise(1),
     ),
-    "tqc_betas": _pendulum("TQC", _variants(TQC, CChainTQC, policy="5e-5", value="1e-3"), "SB3's settings otherwise"),
-    "crossq_betas": _pendulum(
-        "CrossQ", _variants(CrossQ, CChainCrossQ, policy="5e-5 0.01", value="1e-3"), "SB3's settings otherwise"
-    ),
+    "tqc_betas": _pendulum("TQC", _variants(TQC, CChainTQC, policy="5e-5", value="1e-3")),
+    "crossq_betas": _pendulum("CrossQ", _variants(CrossQ, CChainCrossQ, policy="5e-5 0.01", value="1e-3")),
 }

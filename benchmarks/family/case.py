@@ -1,11 +1,13 @@
-"""What describes a comparison."""
+"""A case: algorithms that are compared in an environment."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise
 
 
 @dataclass(frozen=True)
@@ -66,3 +68,11 @@ class Case:
     solved: float | None = None
     worst: float = 0.0
     monitor: Mapping[str, Any] | None = None
+
+
+def action_noise(n_actions: int) -> NormalActionNoise:
+    """
+    :param n_actions: Dimensions of the actions
+    :return: Noise with a standard deviation of 0.1 for each
+    """
+    return NormalActionNoise(np.zeros(n_actions), np.full(n_actions, 0.1))

@@ -2,23 +2,16 @@
 
 from typing import Any
 
-import numpy as np
 from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
-from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
 from benchmarks.family.betas import BETAS
-from benchmarks.family.case import Case, Variant
+from benchmarks.family.case import Case, Variant, action_noise
 from benchmarks.family.masked_symbols import continual_masked_symbols
 from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.algorithms.contrib import CChainMaskablePPO, CChainQRDQN, CChainRecurrentPPO
-
-
-def _noise(n_actions: int) -> NormalActionNoise:
-    return NormalActionNoise(np.zeros(n_actions), np.full(n_actions, 0.1))
-
 
 RL_ZOO = "RL Zoo's settings"
 CHAIN = "settings of the code released with CHAIN"
@@ -102,7 +95,7 @@ EVIDENCE = {
         eval_freq=1000,
         settings={
             **{"learning_rate": 1e-3, "gamma": 0.98, "buffer_size": 200_000, "learning_starts": 10_000, "train_freq": 1},
-            **{"gradient_steps": 1, "action_noise": _noise(1), "policy_kwargs": {"net_arch": [400, 300]}},
+            **{"gradient_steps": 1, "action_noise": action_noise(1), "policy_kwargs": {"net_arch": [400, 300]}},
         },
     ),
     "qrdqn_continual_cartpole": Case(
@@ -197,7 +190,7 @@ EVIDENCE = {
         steps=150_000,
         eval_freq=5000,
         seeds=3,
-        settings={**_CHAIN_TD3, "action_noise": _noise(3)},
+        settings={**_CHAIN_TD3, "action_noise": action_noise(3)},
         n_eval_episodes=5,
     ),
     "sac_walker": Case(
@@ -221,7 +214,7 @@ EVIDENCE = {
         steps=100_000,
         eval_freq=5000,
         seeds=3,
-        settings={**_CHAIN_TD3, "action_noise": _noise(6)},
+        settings={**_CHAIN_TD3, "action_noise": action_noise(6)},
         env_kwargs={"tasks": ["stand", "walk"], "steps_per_task": 50_000},
         n_eval_episodes=5,
         n_tasks=2,

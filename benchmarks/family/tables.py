@@ -121,13 +121,12 @@ def case_table(case: Case, evaluations: Evaluations) -> str:
 
 
 def _churn_shares(evaluations: Evaluations, name: str) -> list[str]:
-    """Mean churn of a variant, of the policy and of the values, as shares of the first variant's."""
+    """Mean churn of a variant, of the policy and of the values, as shares of the first variant's with the same seeds."""
     base = next(iter(evaluations))
-    if not evaluations[name] or not evaluations[base]:
+    seeds = evaluations[base].keys() & evaluations[name].keys()
+    if not seeds:
         return ["", ""]
-    churn, churn_of_base = (
-        np.nanmean([each[:, 2:] for each in evaluations[key].values()], axis=(0, 1)) for key in (name, base)
-    )
+    churn, churn_of_base = (np.nanmean([evaluations[key][seed][:, 2:] for seed in seeds], axis=(0, 1)) for key in (name, base))
     return [number(share) for share in churn / churn_of_base]
 
 
