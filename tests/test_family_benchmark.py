@@ -72,12 +72,19 @@ def test_a_table_of_the_seeds(runs):
 def test_churn_is_shown_as_a_share_of_the_base(runs, monkeypatch):
     case = replace(SMALL, monitor={})
     monkeypatch.setattr(training, "CASES", {"small": case})
+
+    def shares():
+        _, _, base, cchain = rows(case_table(case, read_all(runs)))
+        return base[-2:], cchain[-2:]
+
     # No update before the first evaluation
     for run, (policy, values) in zip(runs, [(1.0, 40.0), (0.5, 10.0), (3.0, 40.0)], strict=False):
         write(run, ["0,,", *[f"0,{policy},{values}"] * 7], "mean_return,policy_churn,value_churn")
-    _, _, base, cchain = rows(case_table(case, read_all(runs)))
-    # 0.5 of a mean of 2, 10 of 40
-    assert base[-2:] == ["1.00", "1.00"] and cchain[-2:] == ["0.25", "0.25"]
+    # Of the seed that both have: 0.5 of 1, 10 of 40
+    assert shares() == (["1.00", "1.00"], ["0.50", "0.25"])
+    write(runs[3], ["0,0.5,10"] * 8, "mean_return,policy_churn,value_churn")
+    # Over both seeds: 0.5 of a mean of 2, 10 of 40
+    assert shares() == (["1.00", "1.00"], ["0.25", "0.25"])
 
 
 def test_churn_is_measured(runs, monkeypatch):
