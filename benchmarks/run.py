@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 from rich.console import Console
 
+from benchmarks.grid.arguments import add_gpu_argument
 from benchmarks.grid.attempts import PACKAGES, newest_checkpoint
 from benchmarks.grid.executor import LocalBackend, complete, ended_by_sigterm
 from benchmarks.grid.plan import BUDGETS, N_SEEDS, Rates, grid_runs, shelf_runs
@@ -64,13 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dry-run", action="store_true", help="List the runs and what they will cost, and train nothing")
     parser.add_argument("--address", help="Address of a Ray cluster; by default this machine alone, without Ray")
     parser.add_argument("--cpus", type=int, help="Runs at a time on this machine, by default one per core")
-    parser.add_argument("--gpus-per-run", type=float, default=0.0, help="GPUs of a run, e.g. 0.25; by default none is used")
+    add_gpu_argument(parser)
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results"), help="Folder of the results")
     parser.add_argument("--logs", type=Path, default=Path("logs/grid"), help="Folder of the logs, on the machine of the run")
     args = parser.parse_args(arguments)
-    # As Ray divides GPUs
-    if not (0.0001 <= args.gpus_per_run <= 1 or (args.gpus_per_run >= 0 and args.gpus_per_run.is_integer())):
-        parser.error(f"--gpus-per-run must be from 0.0001 to 1, or a whole number; got {args.gpus_per_run}")
     if args.cpus is not None and (args.cpus < 1 or args.address):
         parser.error(f"--cpus must be at least 1, and goes without --address, whose nodes have their own; got {args.cpus}")
 

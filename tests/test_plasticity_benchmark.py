@@ -111,6 +111,12 @@ def test_errors_come_before_any_work(tmp_path, capsys, arguments, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_gpus_that_are_not_there_are_an_error(tmp_path):
+    with pytest.raises(SystemExit, match=r"--gpus-per-run must be at most the GPUs of this machine, .*; got 99"):
+        command(tmp_path, "--gpus-per-run", "99")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_command_trains_once_and_keeps_the_ntk(tmp_path, capsys, monkeypatch):
     program = partial(LocalBackend, program=fake_program(tmp_path / "fake", {}))
     monkeypatch.setattr("benchmarks.grid.executor.LocalBackend", program)

@@ -26,6 +26,30 @@ def add_variant_arguments(
     parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
 
 
+def add_gpu_argument(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: The parser of a command that trains
+    """
+    parser.add_argument(
+        "--gpus-per-run", type=gpus_per_run, default=0.0, help="GPUs of a run, e.g. 0.25; by default none is used"
+    )
+
+
+def gpus_per_run(text: str) -> float:
+    """
+    :param text: A share of a GPU, or a number of GPUs, as it is written
+    :return: The number
+    :raises argparse.ArgumentTypeError: For one that Ray does not offer
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if 0.0001 <= number <= 1 or (number >= 0 and number.is_integer()):
+        return number
+    raise argparse.ArgumentTypeError(f"must be from 0.0001 to 1, or a whole number; got {text}")
+
+
 def add_folder_arguments(
     parser: argparse.ArgumentParser, results: str = "benchmarks/results", logs: str | None = None
 ) -> None:

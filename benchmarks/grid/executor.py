@@ -129,19 +129,26 @@ def complete(
     return view.failures
 
 
-def train_all(runs: Sequence[Run], output: Path, n_jobs: int = 2, logs: Path | None = None) -> list[Result]:
+def train_all(
+    runs: Sequence[Run], output: Path, n_jobs: int = 2, logs: Path | None = None, gpus_per_run: float = 0.0
+) -> list[Result]:
     """
-    Bring all runs of a command to their end on this machine, each tried once, and leave the process when runs failed or on
-    Ctrl-C.
+    Bring all runs of a command to their end on this machine, each tried once, and leave the process when runs failed, on
+    Ctrl-C, and when the machine has not what they need.
 
     :param runs: The runs
     :param output: Folder of the results
     :param n_jobs: Runs at a time
     :param logs: Folder of the logs, by default ``training`` in that of the results
+    :param gpus_per_run: As of :class:`LocalBackend`
     :return: Their results
     """
     try:
-        with ended_by_sigterm(), LocalBackend(n_jobs) as backend:
+        backend = LocalBackend(n_jobs, gpus_per_run)
+    except ValueError as error:
+        sys.exit(str(error))
+    try:
+        with ended_by_sigterm(), backend:
             failures = complete(runs, output, logs or output / "training", backend, retries=0)
     except KeyboardInterrupt:
         sys.exit("Interrupted. The same command goes on.")

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from benchmarks.grid.arguments import add_folder_arguments
+from benchmarks.grid.arguments import add_folder_arguments, add_gpu_argument
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS, run_length
 from benchmarks.grid.results import find_result
@@ -47,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps-per-task", type=int, help="Environment steps per task, by default the budget's")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="Seeds of agents, and of Gym Control's offsets")
     parser.add_argument("--jobs", type=int, default=1, help="Runs at a time")
+    add_gpu_argument(parser)
     parser.add_argument("--dry-run", action="store_true", help="List the runs and what they will cost, and train nothing")
     parser.add_argument(
         "--write", action="store_true", help="Put all tables and pictures into the documentation, train nothing"
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         list_grid(runs, args.results, args.logs, Console())
         return
     try:
-        results = train_all(runs, args.results, args.jobs, args.logs)
+        results = train_all(runs, args.results, args.jobs, args.logs, args.gpus_per_run)
     finally:  # also when only some of them were done before it was interrupted
         for result in filter(None, (find_result(run, args.results) for run in runs)):
             keep_snapshots(result, args.logs)
