@@ -440,7 +440,7 @@ class Record(KVWriter):
 def plain(value: Any) -> Any:
     """What can be compared and sent to another process: arrays by a hash of their bytes."""
     if isinstance(value, th.Tensor):
-        value = value.detach().numpy()
+        value = value.detach().cpu().numpy()
     if isinstance(value, np.generic):
         value = np.asarray(value)
     if isinstance(value, np.ndarray) and value.dtype == object:
