@@ -157,6 +157,17 @@ def test_evaluation_mode_gives_every_module_its_own_back():
     assert [module.training for module in network.modules()] == [True, True, True, False]
 
 
+def test_recurrent_layers_keep_their_mode_without_their_dropout():
+    """cuDNN computes no gradient of them in evaluation mode."""
+    th.manual_seed(0)
+    lstm, sequence = th.nn.LSTM(2, 3, num_layers=2, dropout=0.9), th.randn(4, 2)
+    with evaluation_mode(lstm):
+        assert lstm.training
+        inside = lstm(sequence)[0]
+    assert lstm.training and lstm.dropout == 0.9 and not th.equal(lstm(sequence)[0], inside)
+    assert th.equal(lstm.eval()(sequence)[0], inside)
+
+
 def test_unknown_algorithms():
     with pytest.raises(TypeError, match="SimpleNamespace with object are not known"):
         model_outputs(SimpleNamespace(policy=object()), {"observations": OBSERVATIONS})

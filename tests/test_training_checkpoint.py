@@ -535,6 +535,20 @@ def test_another_format(path):
         find_checkpoint(step(path, NEWEST))
 
 
+def test_another_device(path):
+    """The reference batch and the replay buffer are on it, so training would fail or differ."""
+    with pytest.raises(ValueError, match=r"`device` must be cpu, on which .* was trained; got cuda\. To go on from its param"):
+        resume(path, make_env(), device="cuda")
+    assert find_checkpoint(path).device() == th.device("cpu")
+
+
+def test_a_device_that_is_not_here(path):
+    change_info(step(path, NEWEST), device="cuda:99")
+    message = rf"was trained on cuda:99, which PyTorch does not find here \(.*load {step(path, NEWEST)}/model.zip on another"
+    with pytest.raises(ValueError, match=message):
+        resume(path, make_env())
+
+
 def test_a_changed_number_is_noticed(path):
     file = step(path, NEWEST) / "checkpoint.json"
     file.write_text(file.read_text().replace(f'"num_timesteps": {NEWEST}', f'"num_timesteps": {NEWEST - 1}'))

@@ -183,6 +183,12 @@ def test_another_training_is_refused(checkpoints, tmp_path, changes, message):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_another_device_is_refused(checkpoints, tmp_path):
+    with pytest.raises(SystemExit, match="--resume: `device` must be cpu, on which .* was trained; got cuda"):
+        train(tmp_path, "--resume", checkpoints, "--device", "cuda", evaluation=NO_EVALUATION)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     "options, message",
     [

@@ -12,7 +12,8 @@ from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
-from sb3_cchain.networks.policy_outputs import as_it_acts, has_training_mode
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
+from sb3_cchain.networks.policy_outputs import has_training_mode
 from sb3_cchain.validation import check_choice
 
 SelfCChainDQN = TypeVar("SelfCChainDQN", bound="CChainDQN")
@@ -144,7 +145,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
         # Reference batches go through the network as it acts in the environment: they do not move the running statistics
         # of BatchNorm, and the noise of dropout is no churn
         current, next_values = self._q_values(replay_data)
-        with as_it_acts(self.policy):
+        with evaluation_mode(self.q_net):
             previous_values = None if previous is None else self.q_net(previous)
             with th.no_grad():
                 return QValues(current, next_values, self.q_net(reference), previous_values)

@@ -19,13 +19,14 @@ from platform import python_version
 from typing import Any, TextIO
 
 import numpy as np
+import torch as th
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.files import check_path, check_writable, sync_folder, write_safely
 from sb3_cchain.locked_file import open_locked
 
 # Of the files. A later version of the package reads it, or says that it does not
-FORMAT = 2
+FORMAT = 3
 INFO, MODEL, STATE = "checkpoint.json", "model.zip", "training.pkl"
 PACKAGES = ("sb3-cchain", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy")
 
@@ -92,6 +93,24 @@ class Checkpoint:
                 f"{self.path / STATE} cannot be read ({error}): it was made with other code, sb3-cchain {made_with}"
             ) from error
         return state
+
+    def device(self, wanted: th.device | str = "auto") -> th.device:
+        """
+        :param wanted: PyTorch device to go on on; ``"auto"`` for that of the training
+        :return: The device of the training
+        :raises ValueError: When ``wanted`` is another one, or PyTorch does not find it here: training would not be the same
+        """
+        saved = th.device(self.info["device"])
+        instead = f"To go on from its parameters alone, load {self.model_path} on another device."
+        if wanted != "auto" and _place(th.device(wanted)) != _place(saved):
+            raise ValueError(f"`device` must be {saved}, on which {self.path} was trained; got {wanted}. {instead}")
+        try:
+            th.empty(0, device=saved)
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(
+                f"{self.path} was trained on {saved}, which PyTorch does not find here ({error}). {instead}"
+            ) from error
+        return saved
 
     def check_numpy(self) -> None:
         """
@@ -279,6 +298,10 @@ def step_name(num_timesteps: int) -> str:
     :return: Name of the checkpoint's folder
     """
     return f"step_{num_timesteps:012d}"
+
+
+def _place(device: th.device) -> tuple[str, int]:
+    return device.type, device.index or 0
 
 
 def _major(version_number: str) -> int:

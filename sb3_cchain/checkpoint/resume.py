@@ -42,7 +42,7 @@ def resume(
         before
     :param logger: The logger. By default the model logs to the same folder in the same formats. Files that SB3 would overwrite
         are new ones, such as ``progress_from_step_50000.csv``
-    :param device: PyTorch device
+    :param device: PyTorch device, which must be that of the training; ``"auto"`` takes it
     :return: The trained model
     :raises ValueError: When there is no whole checkpoint, when the training was at its end already, or naming what differs
         from the training that was saved
@@ -58,6 +58,7 @@ def resume(
             f"`total_timesteps` must be more than {checkpoint.num_timesteps}, the steps that the model in {checkpoint.path} "
             f"was trained for; got {total_timesteps or checkpoint.total_timesteps}"
         )
+    device = checkpoint.device(device)
     made = maybe_make_env(env, verbose=0)
     assert made is not None
     model = load_model(checkpoint, made, device)
@@ -74,14 +75,14 @@ def load_model(checkpoint: Checkpoint, env: GymEnv, device: th.device | str = "a
     """
     :param checkpoint: A checkpoint
     :param env: The environment to go on in
-    :param device: PyTorch device
+    :param device: PyTorch device, as in :func:`resume`
     :return: The model, as Stable-Baselines3 loads it
-    :raises ValueError: When the installed NumPy cannot read it
+    :raises ValueError: When the installed NumPy cannot read it, or it was trained on another device
     """
     checkpoint.check_numpy()
     module, name = checkpoint.info["algorithm"].split(":")
     algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
-    return algorithm.load(checkpoint.model_path, env, device)
+    return algorithm.load(checkpoint.model_path, env, checkpoint.device(device))
 
 
 def with_checkpoint(given: list[BaseCallback], checkpoint: Checkpoint) -> list[BaseCallback]:

@@ -264,6 +264,7 @@ class TrainingCheckpoint(BaseCallback):
             "algorithm": f"{type(self.model).__module__}:{type(self.model).__qualname__}",
             "environment": self._environment,
             "model": describe_model(self.model),
+            "device": str(self.model.device),
             "callbacks": describe_callbacks(self._parts.callbacks),
             "learn": {name: self.locals[name] for name in ("log_interval", "tb_log_name", "progress_bar")},
             "log": describe_log(self.model),

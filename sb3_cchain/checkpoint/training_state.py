@@ -154,7 +154,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
         ],
         "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, known),
         "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
-        "random": _random_state(),
+        "random": _random_state(model.device),
     }
     return state, left_out
 
@@ -206,7 +206,7 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
     for name, values in state["logged"].items():
         vars(model.logger)[name].clear()
         vars(model.logger)[name].update(values)
-    _restore_random_state(state["random"])
+    _restore_random_state(state["random"], model.device)
 
 
 def _restore_parameters(model: BaseAlgorithm, path: Path) -> None:
@@ -223,18 +223,16 @@ def _gsde(model: BaseAlgorithm) -> list[StateDependentNoiseDistribution]:
     return [found for found in distributions if isinstance(found, StateDependentNoiseDistribution)]
 
 
-def _random_state() -> dict[str, Any]:
-    return {
-        "python": random.getstate(),
-        "numpy": np.random.get_state(),
-        "torch": th.get_rng_state(),
-        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
-    }
+def _random_state(device: th.device) -> dict[str, Any]:
+    state = {"python": random.getstate(), "numpy": np.random.get_state(), "torch": th.get_rng_state()}
+    if device.type == "cuda":
+        state["cuda"] = th.cuda.get_rng_state(device)
+    return state
 
 
-def _restore_random_state(state: Mapping[str, Any]) -> None:
+def _restore_random_state(state: Mapping[str, Any], device: th.device) -> None:
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
-    if th.cuda.is_available() and len(state["cuda"]) == th.cuda.device_count():
-        th.cuda.set_rng_state_all(state["cuda"])
+    if device.type == "cuda":
+        th.cuda.set_rng_state(state["cuda"], device)

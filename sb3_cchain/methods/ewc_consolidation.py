@@ -11,6 +11,7 @@ from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.methods.ewc import EWC
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
@@ -118,16 +119,16 @@ class EWCConsolidation(TaskBoundary):
         return arrays[(first + at // n_envs) % len(arrays), at % n_envs]
 
     def _consolidate(self, observations: Any) -> None:
-        self.model.policy.set_training_mode(False)
         optimizers = self._optimizers()
         fisher = {p: th.zeros_like(p) for optimizer in optimizers for p in optimizer.parameters()}
         trained = [parameter for parameter in fisher if parameter.requires_grad]
         samples = _one_by_one(observations, self.model.device)
-        for observation in samples:
-            gradients = th.autograd.grad(self._log_probability(observation), trained, allow_unused=True)
-            for parameter, gradient in zip(trained, gradients, strict=True):
-                if gradient is not None:
-                    fisher[parameter] += gradient.square()
+        with evaluation_mode(self.model.policy):
+            for observation in samples:
+                gradients = th.autograd.grad(self._log_probability(observation), trained, allow_unused=True)
+                for parameter, gradient in zip(trained, gradients, strict=True):
+                    if gradient is not None:
+                        fisher[parameter] += gradient.square()
         for optimizer in optimizers:
             optimizer.consolidate([fisher[parameter] / len(samples) for parameter in optimizer.parameters()])
 

@@ -59,9 +59,10 @@ class _Categorical:
         return -(finite * self.probs).sum(-1)
 
     def sample(self) -> th.Tensor:
-        # On the CPU multinomial() itself looks for NaN; on a GPU it would end the process
-        probs = self.probs if self.probs.device.type == "cpu" else _without_nan(self.probs)
-        try:
+        probs = self.probs
+        if probs.device.type != "cpu":  # where multinomial() would end the process
+            return th.multinomial(_without_nan(probs), 1, replacement=True).squeeze(-1)
+        try:  # it looks for NaN itself
             return th.multinomial(probs, 1, replacement=True).squeeze(-1)
         except RuntimeError as error:
             raise ValueError(NAN_OUTPUTS) from error

@@ -1,7 +1,6 @@
 """The outputs of an SB3 actor-critic policy, by kind of action distribution; how any policy acts."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -13,7 +12,7 @@ from stable_baselines3.common.distributions import (
     MultiCategoricalDistribution,
     StateDependentNoiseDistribution,
 )
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.distributions import Bernoulli, Categorical
@@ -152,17 +151,3 @@ def has_training_mode(policy: nn.Module) -> bool:
         or (isinstance(module, nn.RNNBase) and module.dropout > 0)
         for module in policy.modules()
     )
-
-
-@contextmanager
-def as_it_acts(policy: BasePolicy) -> Iterator[None]:
-    """
-    Evaluation mode, inside ``train()``: running BatchNorm statistics and no dropout, whose noise is no churn.
-
-    :param policy: A policy in training mode; left in training mode
-    """
-    policy.set_training_mode(False)
-    try:
-        yield
-    finally:
-        policy.set_training_mode(True)

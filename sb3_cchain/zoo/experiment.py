@@ -129,6 +129,10 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         assert self.checkpoints is not None
         if differing := differences(self.checkpoints.record, self.args, self._hyperparameters_read):
             sys.exit(f"--resume: the training in {checkpoint.path} had {'; '.join(differing)}. Give the options that it had")
+        try:
+            checkpoint.device(self.device)
+        except ValueError as error:
+            sys.exit(f"--resume: {error}")
         done, final = checkpoint.num_timesteps, checkpoint.folder.parent / f"{self.env_name}.zip"
         # One who names a checkpoint wants to go on from there in any case
         if checkpoint.path != self.checkpoints.resume and final.is_file():
@@ -226,9 +230,10 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if self.resumed is not None:
             # The rest, statistics and replay buffer included, is put back when training starts
             kept = {name: value for name, value in hyperparams.items() if name not in ("policy", "policy_kwargs")}
-            for name in ("seed", "tensorboard_log", "verbose", "device"):
+            for name in ("seed", "tensorboard_log", "verbose"):
                 kept[name] = getattr(self, name)
-            return rl_zoo3.ALGOS[self.algo].load(self.trained_agent, env=env, **kept)
+            device = self.resumed.device(self.device)
+            return rl_zoo3.ALGOS[self.algo].load(self.trained_agent, env=env, device=device, **kept)
         normalize = unwrap_vec_normalize(env)
         if normalize is not None:
             load_statistics(normalize, self._find_statistics())
