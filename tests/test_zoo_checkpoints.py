@@ -184,7 +184,7 @@ def test_another_training_is_refused(checkpoints, tmp_path, changes, message):
 
 
 def test_another_device_is_refused(checkpoints, tmp_path):
-    with pytest.raises(SystemExit, match="--resume: `device` must be cpu, on which .* was trained; got cuda"):
+    with pytest.raises(SystemExit, match=r"--resume: `device` must be cpu, on which .* was trained; got cuda"):
         train(tmp_path, "--resume", checkpoints, "--device", "cuda", evaluation=NO_EVALUATION)
     assert list(tmp_path.iterdir()) == []
 
