@@ -134,7 +134,7 @@ def train_all(
 ) -> list[Result]:
     """
     Bring all runs of a command to their end on this machine, each tried once, and leave the process when runs failed, on
-    Ctrl-C, and when the machine has not what they need.
+    Ctrl-C, and when the machine lacks the GPUs that they need.
 
     :param runs: The runs
     :param output: Folder of the results

@@ -96,7 +96,7 @@ class Checkpoint:
 
     def device(self, wanted: th.device | str = "auto") -> th.device:
         """
-        :param wanted: PyTorch device to go on on; ``"auto"`` for that of the training
+        :param wanted: PyTorch device to continue on; ``"auto"`` for that of the training
         :return: The device of the training
         :raises ValueError: When ``wanted`` is another one, or PyTorch does not find it here: training would not be the same
         """

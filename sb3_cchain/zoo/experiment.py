@@ -130,7 +130,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if differing := differences(self.checkpoints.record, self.args, self._hyperparameters_read):
             sys.exit(f"--resume: the training in {checkpoint.path} had {'; '.join(differing)}. Give the options that it had")
         try:
-            checkpoint.device(self.device)
+            self.device = checkpoint.device(self.device)
         except ValueError as error:
             sys.exit(f"--resume: {error}")
         done, final = checkpoint.num_timesteps, checkpoint.folder.parent / f"{self.env_name}.zip"
@@ -230,10 +230,9 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if self.resumed is not None:
             # The rest, statistics and replay buffer included, is put back when training starts
             kept = {name: value for name, value in hyperparams.items() if name not in ("policy", "policy_kwargs")}
-            for name in ("seed", "tensorboard_log", "verbose"):
+            for name in ("seed", "tensorboard_log", "verbose", "device"):
                 kept[name] = getattr(self, name)
-            device = self.resumed.device(self.device)
-            return rl_zoo3.ALGOS[self.algo].load(self.trained_agent, env=env, device=device, **kept)
+            return rl_zoo3.ALGOS[self.algo].load(self.trained_agent, env=env, **kept)
         normalize = unwrap_vec_normalize(env)
         if normalize is not None:
             load_statistics(normalize, self._find_statistics())
