@@ -3,6 +3,8 @@
 import importlib
 from contextlib import suppress
 
+from gymnasium.error import DependencyNotInstalled
+
 import tests.resume_cases  # noqa: F401
 
 SLOW = (
@@ -20,5 +22,5 @@ SLOW = (
     *("gymnasium.envs.box2d", "sb3_cchain.envs.minatar", "sb3_cchain.envs.dm_control", "sb3_cchain.envs.procgen"),
 )
 for name in SLOW:
-    with suppress(ImportError):
+    with suppress(ImportError, DependencyNotInstalled):
         importlib.import_module(name)
