@@ -12,6 +12,8 @@ from stable_baselines3.common.logger import configure
 from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import write_result
+from benchmarks.grid.run import STRENGTH_COLORS
+from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.__main__ import main
 from benchmarks.plasticity.heat_maps import cosines, plot_heat_maps
 from benchmarks.plasticity.page import read_groups, table
@@ -64,6 +66,14 @@ def test_what_is_compared_in_each_suite(suite, env_id, names, monkeypatch):
         assert others == ([f"churn_component:'{name}'"] if name in COMPONENTS else [])
         assert run.line == name and run.experiment == "plasticity_2x8000" and name in lines(suite)
     assert ("value_churn" in str(quantities(suite))) == (suite == "minatar") and len(quantities(suite)) == 6
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_each_line_has_a_colour_for_itself(suite):
+    values = range(1, len(STRENGTH_COLORS) + 1)
+    strengths = [f"{'l2_init' if value > 5 and suite != 'minatar' else 'cchain'}@{value}" for value in values]
+    colours = [line.color for line in lines(suite, strengths).values()]
+    assert len(colours) > len(STRENGTH_COLORS) and len(set(colours)) == len(colours)
 
 
 @pytest.mark.parametrize("n_tasks, times", [(1, [100]), (2, [100, 150, 200]), (3, [100, 200, 300]), (5, [100, 300, 500])])

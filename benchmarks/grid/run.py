@@ -1,6 +1,7 @@
 """What a training run is: the command that a user would type, and the settings by which a finished run counts as this one."""
 
 import ast
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -16,7 +17,18 @@ from sb3_cchain.zoo.settings import read_settings
 ROOT = Path(__file__).parents[2]
 
 # Of a method with another strength than the shipped one, in the order of the values
-STRENGTH_COLORS = ("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue")
+STRENGTH_COLORS = (
+    "navy",
+    "deepskyblue",
+    "mediumpurple",
+    "turquoise",
+    "slateblue",
+    "black",
+    "sienna",
+    "hotpink",
+    "darkgreen",
+    "maroon",
+)
 
 
 @dataclass(frozen=True)
@@ -229,15 +241,14 @@ def suite_lines(suite: str, lines: Iterable[str] = ()) -> dict[str, Method]:
     :return: Label and colour of all methods of the suite and of those with another strength, in the order of the tables
     """
     methods = suite_methods(suite)
-    colors = dict.fromkeys(methods, 0)
+    colors = itertools.cycle(STRENGTH_COLORS)
     rows = {}
     for line in lines_in_order([*methods, *lines]):
         name, value = split_line(line)
         rows[line] = method = methods[name]
         if value is not None and method.strength is not None:
-            color = STRENGTH_COLORS[colors[name] % len(STRENGTH_COLORS)]
-            colors[name] += 1
-            rows[line] = replace(method, label=f"{method.label}, {method.strength.symbol} = {value}", color=color)
+            label = f"{method.label}, {method.strength.symbol} = {value}"
+            rows[line] = replace(method, label=label, color=next(colors))
     return rows
 
 

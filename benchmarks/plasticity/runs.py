@@ -16,7 +16,7 @@ EXPERIMENT = "plasticity"
 
 # What the paper's analysis compares, and the components of C-CHAIN's gradient in its ablation, with their colours
 METHODS = ("vanilla", "trac", "cchain")
-COMPONENTS = {"projection": "tab:orange", "orthogonal": "tab:green"}
+COMPONENTS = {"projection": "magenta", "orthogonal": "limegreen"}
 
 # How often a run is looked at, at most. A matrix of ProcGen's network takes 3.5 s of a core and 0.45 GB of memory
 N_LOOKS = 200

@@ -220,7 +220,7 @@ REGISTRY = (
         grid={"timestep": [160_000, 320_000, 640_000]},  # the first switch of Gym Control's tasks, and later ones
     ),
     Method(
-        *("normalize_and_project", "ppo_normalize_and_project", PPO, "Normalize and project", "navy", OPTIMIZER_PAGE),
+        *("normalize_and_project", "ppo_normalize_and_project", PPO, "Normalize and project", "yellowgreen", OPTIMIZER_PAGE),
         optimizer_class=NormalizeAndProject,
         optimizer_kwargs={"n_output_layers": 2},
         callbacks=(OptimizerMetrics,),
