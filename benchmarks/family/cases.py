@@ -116,7 +116,8 @@ EVIDENCE = {
         "Continual/CartPole-v1",
         {
             "recurrent_ppo": Variant("RecurrentPPO", RecurrentPPO),
-            "cchain": Variant("C-CHAIN RecurrentPPO", CChainRecurrentPPO),
+            "cchain": Variant("C-CHAIN RecurrentPPO, β 1e4 (default)", CChainRecurrentPPO, {"target_churn_ratio": 1e4}),
+            "cchain_1e2": Variant("C-CHAIN RecurrentPPO, β 1e2", CChainRecurrentPPO, {"target_churn_ratio": 1e2}),
         },
         steps=90_000,
         eval_freq=3000,

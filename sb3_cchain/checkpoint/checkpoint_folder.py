@@ -333,7 +333,10 @@ def _read_info(path: Path) -> dict[str, Any]:
         raise ValueError(f"{file} is damaged: {error}") from error
     if found != FORMAT:
         made_with = info.get("versions", {}).get("sb3-cchain", "an unknown version")
-        raise ValueError(f"{path} has the format {found} of sb3-cchain {made_with}; this version reads the format {FORMAT}")
+        raise ValueError(
+            f"{path} has the format {found} of sb3-cchain {made_with}; this version reads the format {FORMAT}. "
+            f"To go on from its parameters alone, load {path / MODEL}"
+        )
     info.pop("checksum", None)
     if text != _info_text(info):
         raise ValueError(f"{file} is damaged: it is not what was written")
