@@ -116,8 +116,8 @@ EVIDENCE = {
         "Continual/CartPole-v1",
         {
             "recurrent_ppo": Variant("RecurrentPPO", RecurrentPPO),
-            "cchain": Variant("C-CHAIN RecurrentPPO, β 1e4 (default)", CChainRecurrentPPO, {"target_churn_ratio": 1e4}),
-            "cchain_1e2": Variant("C-CHAIN RecurrentPPO, β 1e2", CChainRecurrentPPO, {"target_churn_ratio": 1e2}),
+            "cchain": Variant("C-CHAIN RecurrentPPO, β 1e4", CChainRecurrentPPO, {"target_churn_ratio": 1e4}),
+            "cchain_1e2": Variant("C-CHAIN RecurrentPPO, β 1e2 (default)", CChainRecurrentPPO, {"target_churn_ratio": 1e2}),
         },
         steps=90_000,
         eval_freq=3000,
@@ -134,9 +134,9 @@ EVIDENCE = {
         continual_masked_symbols,
         {
             "maskable_ppo": Variant("MaskablePPO", MaskablePPO),
-            "cchain": Variant("C-CHAIN MaskablePPO, β 1e4 (default)", CChainMaskablePPO),
+            "cchain": Variant("C-CHAIN MaskablePPO, β 1e4", CChainMaskablePPO, {"target_churn_ratio": 1e4}),
             "cchain_1e3": Variant("C-CHAIN MaskablePPO, β 1e3", CChainMaskablePPO, {"target_churn_ratio": 1e3}),
-            "cchain_1e2": Variant("C-CHAIN MaskablePPO, β 1e2", CChainMaskablePPO, {"target_churn_ratio": 1e2}),
+            "cchain_1e2": Variant("C-CHAIN MaskablePPO, β 1e2 (default)", CChainMaskablePPO, {"target_churn_ratio": 1e2}),
         },
         steps=120_000,
         eval_freq=3000,
