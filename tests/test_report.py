@@ -416,19 +416,27 @@ def test_a_rollout_over_a_switch_counts_in_both_tasks(tmp_path):
     assert series == [[[60, 120], [900.0, 910.0]], [[120, 240], [100.0, 110.0]]]
 
 
-def test_the_legend_of_all_methods_fits(tmp_path, monkeypatch):
-    """Those of ProcGen, the most that there are."""
+GYM_METHODS = suite_methods("gym_control")
+LONGEST_LABELS = sorted(GYM_METHODS, key=lambda name: len(GYM_METHODS[name].label))[-6:]
+
+
+@pytest.mark.parametrize(
+    "suite, env_id, methods",
+    [("procgen", "Continual/Maze-v0", paper_methods("procgen")), ("gym_control", ACROBOT, LONGEST_LABELS)],
+    ids=["the most in a suite of the paper", "the longest names"],
+)
+def test_the_legend_fits(suite, env_id, methods, tmp_path, monkeypatch):
     import matplotlib.pyplot as plt
 
-    for method in paper_methods("procgen"):
-        write(tmp_path, method, [[0, 1], [0, 1]], "Continual/Maze-v0", suite="procgen")
+    for method in methods:
+        write(tmp_path, method, [[0, 1], [0, 1]], env_id, suite=suite)
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
-    plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", suite_methods("procgen"))
+    plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", suite_methods(suite))
     monkeypatch.undo()
     (figure,) = figures
     (legend,) = figure.legends
-    assert len(legend.get_texts()) == 9
+    assert len(legend.get_texts()) == len(methods)
     box = legend.get_window_extent()
     assert 0 <= box.x0 and box.x1 <= figure.bbox.width
     plt.close(figure)

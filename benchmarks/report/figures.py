@@ -204,7 +204,11 @@ def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
     for panel in panels:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             legend.setdefault(label, handle)
-    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=min(len(legend), 5), frameon=False)
+    for n_columns in range(min(len(legend), 5), 0, -1):
+        drawn = figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=n_columns, frameon=False)
+        if n_columns == 1 or drawn.get_window_extent().width <= figure.bbox.width:
+            break
+        drawn.remove()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     plt.close(figure)
