@@ -60,12 +60,9 @@ class WrittenOutPPO(PPO):
         self.n_optimizer_steps += 1
 
 
-# All kinds and sizes with a discrete policy. The continuous one differs in the outputs alone, so two of them are enough
-REFERENCES_AND_ENVS = [
-    *((kind, size, "CartPole-v1") for kind in ("independent", "next") for size in (0.5, 1, 2)),
-    *[("independent", 1, "Pendulum-v1"), ("next", 0.5, "Pendulum-v1")],
-]
-each_reference = pytest.mark.parametrize("churn_reference, churn_batch_size, env_id", REFERENCES_AND_ENVS)
+each_reference = pytest.mark.parametrize(
+    "churn_reference, churn_batch_size", [(kind, size) for kind in ("independent", "next") for size in (0.5, 1, 2)]
+)
 
 
 def written_out_ppo(churn_reference, churn_batch_size):
@@ -94,9 +91,10 @@ def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, 
     assert differ(seam, plain)  # the term makes a difference
 
 
+@pytest.mark.parametrize("env_id, target_kl", [("CartPole-v1", None), ("Pendulum-v1", 0.0005)])
 @each_reference
-def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, churn_reference, churn_batch_size):
-    settings = dict(PPO_SETTINGS, target_kl={"CartPole-v1": None, "Pendulum-v1": 0.0005}[env_id])
+def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, target_kl, churn_reference, churn_batch_size):
+    settings = dict(PPO_SETTINGS, target_kl=target_kl)
     with spied(on_policy, "joint_passes") as joint:
         written_out, seam = (
             learn_in_double_precision(make, 64 * N_ITERATIONS, env_id, **settings)
@@ -110,9 +108,9 @@ def test_joint_passes_equal_sb3_source_with_the_term_in_its_loss(env_id, churn_r
     assert_close(seam, written_out, atol=1e-12)
 
 
+@pytest.mark.parametrize("env_id, target_churn_ratio", [("CartPole-v1", 1e4), ("Pendulum-v1", 0.05)])
 @each_reference
-def test_ppo_equals_a_loop_that_copies_the_network(env_id, churn_reference, churn_batch_size):
-    target_churn_ratio = {"CartPole-v1": 1e4, "Pendulum-v1": 0.05}[env_id]
+def test_ppo_equals_a_loop_that_copies_the_network(env_id, target_churn_ratio, churn_reference, churn_batch_size):
     arguments = dict(target_churn_ratio=target_churn_ratio, churn_warmup=2, churn_window=5, **PPO_SETTINGS)
     arguments.update(churn_reference=churn_reference, churn_batch_size=churn_batch_size)
     copying = learn_in_double_precision(DeepCopyPPO, 64 * 13, env_id, **arguments)
