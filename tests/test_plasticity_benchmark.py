@@ -70,10 +70,11 @@ def test_what_is_compared_in_each_suite(suite, env_id, names, monkeypatch):
 
 @pytest.mark.parametrize("suite", SUITES)
 def test_each_line_has_a_colour_for_itself(suite):
-    values = range(1, len(STRENGTH_COLORS) + 1)
-    strengths = [f"{'l2_init' if value > 5 and suite != 'minatar' else 'cchain'}@{value}" for value in values]
-    colours = [line.color for line in lines(suite, strengths).values()]
-    assert len(colours) > len(STRENGTH_COLORS) and len(set(colours)) == len(colours)
+    names = ["cchain"] if suite == "minatar" else ["cchain", "l2_init"]
+    strengths = [f"{name}@{value}" for name in names for value in range(1, len(STRENGTH_COLORS) // len(names) + 1)]
+    shown = lines(suite, strengths)
+    assert {*strengths, *names} <= set(shown)
+    assert len({line.color for line in shown.values()}) == len(shown)
 
 
 @pytest.mark.parametrize("n_tasks, times", [(1, [100]), (2, [100, 150, 200]), (3, [100, 200, 300]), (5, [100, 300, 500])])

@@ -16,18 +16,10 @@ from sb3_cchain.zoo.settings import read_settings
 
 ROOT = Path(__file__).parents[2]
 
-# Of a method with another strength than the shipped one, in the order of the values
+# Of lines with another strength than the shipped one, in the order of the tables
 STRENGTH_COLORS = (
-    "navy",
-    "deepskyblue",
-    "mediumpurple",
-    "turquoise",
-    "slateblue",
-    "black",
-    "sienna",
-    "hotpink",
-    "darkgreen",
-    "maroon",
+    *("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue"),
+    *("black", "sienna", "hotpink", "darkgreen", "maroon"),
 )
 
 
