@@ -10,6 +10,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_cchain import CChainPPO, ContinualMetrics, DoubleDQN, TaskSignal, TrainingCheckpoint, resume
 from sb3_cchain.callbacks import OverallSchedule, TaskSchedule
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
+from sb3_cchain.methods import ExplorationRateRestart
 from tests.envs import CountEnv
 from tests.method_models import OFF_POLICY, ON_POLICY
 
@@ -107,6 +109,34 @@ def test_saved_in_the_middle_and_loaded(tmp_path, cls):
     assert "_update_current_progress_remaining" not in vars(loaded) and "_excluded_save_params" not in vars(loaded)
     loaded.learn(16, OverallSchedule(96), reset_num_timesteps=False)
     assert loaded._current_progress_remaining == 0.5
+
+
+def test_beside_another_callback_that_watches_the_model(tmp_path):
+    class SaveAtTheEnd(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_training_end(self):
+            self.model.save(tmp_path / "model")
+
+    model = make(DQN)
+    model.learn(48, [OverallSchedule(96), SaveAtTheEnd(), TaskSignal(switch_at=[16]), ExplorationRateRestart()])
+    replaced = {"_update_current_progress_remaining", "_on_step", "_excluded_save_params"}
+    assert not replaced & vars(model).keys() and not replaced & vars(DQN.load(tmp_path / "model", device="cpu")).keys()
+
+
+def test_two_that_watch_the_same_method():
+    model, seen = make(PPO), []
+    first, second = TrainingHooks(), TrainingHooks()
+    for name, hooks in (("first", first), ("second", second)):
+        hooks.begin(model)
+        hooks.after_call(model, "get_vec_normalize_env", lambda _, name=name: seen.append(name))
+    model.get_vec_normalize_env()
+    first.remove()
+    model.get_vec_normalize_env()
+    assert seen == ["first", "second", "second"]
+    second.remove()
+    assert "get_vec_normalize_env" not in vars(model)
 
 
 @pytest.mark.parametrize("make_schedule", [lambda: OverallSchedule(128), lambda: TaskSchedule(24)])

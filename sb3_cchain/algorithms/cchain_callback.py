@@ -13,6 +13,7 @@ from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
+from sb3_cchain.callbacks.replaced_methods import not_saved
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.replaced import replaced
@@ -151,7 +152,7 @@ class CChainCallback(FiniteCheck):
         if not self.churn_reducers.active():
             return
         model: Any = self.model
-        train, not_saved = model.train, [*model._excluded_save_params(), "train", "_excluded_save_params"]
+        train = model.train
 
         def train_once(*args: Any, **kwargs: Any) -> None:
             self._replaced.close()  # first, so that this method is gone when train() fails, too
@@ -165,7 +166,7 @@ class CChainCallback(FiniteCheck):
 
         self._replaced.enter_context(replaced(self.model, "train", train_once))
         # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
-        self._replaced.enter_context(replaced(self.model, "_excluded_save_params", lambda: not_saved))
+        self._replaced.enter_context(not_saved(self.model, "train"))
 
     def _on_training_end(self) -> None:
         self._replaced.close()

@@ -7,7 +7,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_cchain.replaced import replaced
+from sb3_cchain.callbacks.replaced_methods import wrapped
 
 
 class TrainingHooks:
@@ -68,21 +68,33 @@ class TrainingHooks:
         :param method: Name of one of its methods
         :param function: Called with the result of the method, each time that it has returned
         """
-        original = getattr(owner, method)
 
-        def call(*args: Any, **kwargs: Any) -> Any:
-            result = original(*args, **kwargs)
+        def call_both(call: Callable[[], Any]) -> Any:
+            result = call()
             if self._is_over():
                 self.remove()
             else:
                 function(result)
             return result
 
-        self._attached.enter_context(replaced(owner, method, call))
-        if isinstance(owner, BaseAlgorithm):
-            # SB3 saves all attributes of a model; a saved model must not contain these
-            not_saved = [*owner._excluded_save_params(), method, "_excluded_save_params"]
-            self._attached.enter_context(replaced(owner, "_excluded_save_params", lambda: not_saved))
+        self._attached.enter_context(wrapped(owner, method, call_both))
+
+    def on_error(self, owner: object, method: str, function: Callable[[], None]) -> None:
+        """
+        :param owner: The model, or an object that it uses
+        :param method: Name of one of its methods
+        :param function: Called when the method ends by an exception, Ctrl-C included
+        """
+
+        def watch(call: Callable[[], Any]) -> Any:
+            try:
+                return call()
+            except BaseException:
+                if not self._is_over():
+                    function()
+                raise
+
+        self._attached.enter_context(wrapped(owner, method, watch))
 
     def _is_over(self) -> bool:
         # SB3 sets the start time at the beginning of each `learn()`
