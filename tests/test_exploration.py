@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO, SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_cchain import CChainPPO, TaskSignal
 from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
@@ -28,6 +28,20 @@ class Spy(BaseCallback):
     def _on_step(self):
         self.before_steps[self.num_timesteps - 1] = self.read(self.model)
         return True
+
+
+class SpyBeforeTrain(BaseCallback):
+    """Reads ``ent_coef`` when a rollout has ended, right before ``train()``; by the step at which the rollout began."""
+
+    def __init__(self):
+        super().__init__()
+        self.ent_coefs = {}
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.ent_coefs[self.num_timesteps - self.model.n_steps] = self.model.ent_coef
 
 
 def test_the_exploration_rate():
@@ -80,13 +94,30 @@ def test_the_references_are_forgotten():
 
 
 def test_the_entropy_bonus():
-    model, spy = make_model("PPO", CountEnv(), ent_coef=0.1), Spy(lambda model: model.ent_coef)
+    model, spy = make_model("PPO", CountEnv(), ent_coef=0.1), SpyBeforeTrain()
     for steps in (48, 64):
         callbacks = [TaskSignal(switch_at=[32]), EntropyBonusRestart(0.5, n_steps=64), spy]
         model.learn(steps, callbacks, reset_num_timesteps=False)
         assert model.ent_coef == 0.1
     # From 0.5 to the model's 0.1 over 64 steps, a quarter of it a rollout
-    assert spy.before_rollouts == pytest.approx({0: 0.1, 16: 0.1, 32: 0.5, 48: 0.4, 64: 0.3, 80: 0.2, 96: 0.1})
+    assert spy.ent_coefs == pytest.approx({0: 0.1, 16: 0.1, 32: 0.5, 48: 0.4, 64: 0.3, 80: 0.2, 96: 0.1})
+
+
+def test_the_raised_entropy_bonus_is_not_left_in_the_model(tmp_path):
+    class Interruption(CheckpointCallback):
+        def _on_rollout_end(self):
+            if self.num_timesteps == 48:
+                assert model.ent_coef == pytest.approx(0.5)
+                model.policy.optimizer.register_step_pre_hook(self.interrupt)
+
+        def interrupt(self, *_):
+            raise KeyboardInterrupt
+
+    model = make_model("PPO", CountEnv(), ent_coef=0.1)
+    callbacks = [TaskSignal(switch_at=[16]), EntropyBonusRestart(0.5, n_steps=10**9), Interruption(40, tmp_path)]
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, callbacks)
+    assert model.ent_coef == 0.1 and PPO.load(tmp_path / "rl_model_40_steps").ent_coef == 0.1
 
 
 def test_the_users_own_entropy_bonus_may_change_between_calls_of_learn():

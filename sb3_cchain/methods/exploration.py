@@ -106,8 +106,8 @@ class EntropyBonusRestart(TaskBoundary):
     """
     Raises ``ent_coef`` of PPO or A2C at each task switch, from where it goes down linearly to the model's own.
 
-    The first task has the model's own. During training it is kept as ``model.own_ent_coef``; the step of the last switch is
-    kept as ``model.ent_coef_restart``.
+    The first task has the model's own, which the model has in rollouts, too: it is raised for ``train()`` only. The step of
+    the last switch is kept as ``model.ent_coef_restart``.
 
     :param ent_coef: The coefficient at the beginning of each later task
     :param n_steps: Environment steps until it is the model's own again
@@ -123,6 +123,8 @@ class EntropyBonusRestart(TaskBoundary):
         check_number("n_steps", n_steps, 1, integer=True)
         self.ent_coef = ent_coef
         self.n_steps = n_steps
+        self._own_ent_coef: float | None = None  # while it is raised
+        self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
         # TRPO has the argument of its base class and does not use it
@@ -132,8 +134,9 @@ class EntropyBonusRestart(TaskBoundary):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         model: Any = self.model
-        if not hasattr(model, "own_ent_coef"):
-            model.own_ent_coef = model.ent_coef
+        self._own_ent_coef = None
+        self._hooks.begin(model)
+        self._hooks.on_error(model, "train", self._put_back)
         if self.num_timesteps == 0 or not hasattr(model, "ent_coef_restart"):
             model.ent_coef_restart = None
 
@@ -141,16 +144,24 @@ class EntropyBonusRestart(TaskBoundary):
         self.model.ent_coef_restart = self.num_timesteps  # type: ignore[attr-defined]
 
     def _on_rollout_start(self) -> None:
+        self._put_back()
         super()._on_rollout_start()
+        self._rollout_start = self.num_timesteps
+
+    def _on_rollout_end(self) -> None:
         model: Any = self.model
         if model.ent_coef_restart is not None:
-            share = (self.num_timesteps - model.ent_coef_restart) / self.n_steps
-            model.ent_coef = _between(self.ent_coef, model.own_ent_coef, share)
+            share = (self._rollout_start - model.ent_coef_restart) / self.n_steps
+            self._own_ent_coef = model.ent_coef
+            model.ent_coef = _between(self.ent_coef, model.ent_coef, share)
+
+    def _put_back(self) -> None:
+        if self._own_ent_coef is not None:
+            self.model.ent_coef, self._own_ent_coef = self._own_ent_coef, None
 
     def _on_training_end(self) -> None:
-        model: Any = self.model
-        model.ent_coef = model.own_ent_coef
-        del model.own_ent_coef  # the user may give the model another one before the next `learn()`
+        self._put_back()
+        self._hooks.remove()
 
 
 def _between(initial: float, final: float, share: float) -> float:
