@@ -18,6 +18,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import torch as th
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
@@ -681,6 +682,32 @@ def test_a_file_in_the_place_of_the_folder(tmp_path):
     for path in (tmp_path / "file", tmp_path / "file" / "inside"):
         with pytest.raises(ValueError, match=rf"`path` must be a folder that can be written to, got '{path}'"):
             make().learn(STEPS, TrainingCheckpoint(16, path))
+
+
+def test_a_class_that_cannot_be_found_again(tmp_path):
+    class Local(PPO):
+        pass
+
+    with pytest.raises(ValueError, match=r"Local could not be resumed, because there is no such class in its module"):
+        Local("MlpPolicy", make_env(), **ARGUMENTS).learn(32, TrainingCheckpoint(16, tmp_path))
+
+
+class Outer:
+    class Nested(PPO):
+        pass
+
+
+def test_a_class_within_a_class(tmp_path):
+    train(Outer.Nested("MlpPolicy", make_env(), **ARGUMENTS), tmp_path)
+    assert type(go_on(tmp_path)) is Outer.Nested
+
+
+def test_masks_stay_unused(tmp_path):
+    model = MaskablePPO("MlpPolicy", make_env(), **ARGUMENTS)
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [TrainingCheckpoint(32, tmp_path), Stop(110)], use_masking=False)
+    # The environment has no masks, and would be refused
+    assert go_on(tmp_path).num_timesteps == STEPS
 
 
 def test_two_of_them(tmp_path):

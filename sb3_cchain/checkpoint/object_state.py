@@ -157,7 +157,7 @@ def restore_objects(holders: Mapping[str, object], states: ObjectStates, known: 
         there = holders[entry.name] if entry.owner is None else vars(found[entry.owner]).get(entry.name)
         # Two objects may have been one in this process until now
         if entry.kind is not None and (_kind_name(there) != entry.kind or id(there) in taken):
-            there = _make(_find_class(entry.kind))
+            there = _make(find_named(entry.kind))
         found.append(there)
         taken.add(id(there))
     contents = StateUnpickler(io.BytesIO(states.content), {**(known or {}), **dict(enumerate(found))}).load()
@@ -281,7 +281,7 @@ class _Reader:
         if isinstance(code, MethodType):
             return id(code.__self__) in self._references and getattr(code.__self__, code.__name__, None) == code
         try:
-            return _find_class(_name(code)) is code
+            return find_named(name_in_module(code)) is code
         except (AttributeError, ImportError):  # made by other code
             return False
 
@@ -424,14 +424,24 @@ def stock_class(kind: type) -> type:
 
 def _kind_name(value: object) -> str:
     # A generator can take the state of another one with the same algorithm
-    return _name(stock_class(type(value.bit_generator if isinstance(value, np.random.Generator) else value)))
+    return name_in_module(stock_class(type(value.bit_generator if isinstance(value, np.random.Generator) else value)))
 
 
-def _name(named: Any) -> str:
+def name_in_module(named: Any) -> str:
+    """
+    :param named: A class or a function
+    :return: What :func:`find_named` finds it by, ``"module:Class"``
+    """
     return f"{named.__module__}:{named.__qualname__}"
 
 
-def _find_class(name: str) -> Any:
+def find_named(name: str) -> Any:
+    """
+    :param name: Name of a class or a function, ``"module:Class"``
+    :return: What has this name
+    :raises AttributeError: When nothing has
+    :raises ImportError: When its module cannot be imported
+    """
     module, _, qualified = name.partition(":")
     found: Any = importlib.import_module(module)
     for part in qualified.split("."):

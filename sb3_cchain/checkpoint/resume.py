@@ -1,6 +1,5 @@
 """Going on with training that was saved by a TrainingCheckpoint."""
 
-import importlib
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
 from sb3_cchain.checkpoint.log import further_logger
+from sb3_cchain.checkpoint.object_state import find_named
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.validation import check_number
@@ -80,8 +80,7 @@ def load_model(checkpoint: Checkpoint, env: GymEnv, device: th.device | str = "a
     :raises ValueError: When the installed NumPy cannot read it, or it was trained on another device
     """
     checkpoint.check_numpy()
-    module, name = checkpoint.info["algorithm"].split(":")
-    algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
+    algorithm: type[BaseAlgorithm] = find_named(checkpoint.info["algorithm"])
     return algorithm.load(checkpoint.model_path, env, checkpoint.device(device))
 
 

@@ -23,6 +23,7 @@ from sb3_cchain.checkpoint.environment_state import can_save_environment, prepar
 from sb3_cchain.checkpoint.files import check_path, sync_files
 from sb3_cchain.checkpoint.log import describe_log
 from sb3_cchain.checkpoint.new_episodes import begin_new_episodes, lasting_state
+from sb3_cchain.checkpoint.object_state import find_named, name_in_module
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
 from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
 from sb3_cchain.tasks.callback_tree import require_single
@@ -30,6 +31,8 @@ from sb3_cchain.validation import check_bool, check_number
 
 DIFFERENT = "Make the training as it was, or load the model as usual, which begins new episodes."
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Arguments of `learn()` that training goes on with; the last one is MaskablePPO's
+LEARN_ARGUMENTS = ("log_interval", "tb_log_name", "progress_bar", "use_masking")
 
 
 class _Progress(NamedTuple):
@@ -68,7 +71,8 @@ class TrainingCheckpoint(BaseCallback):
         environments begin new episodes when training is resumed
     :raises TypeError: Naming the argument that is of another type. When training starts, for ARS
     :raises ValueError: Naming the argument that is out of its range. When training starts: for environments that cannot be
-        resumed exactly, a folder of another training or one that cannot be written to, or a second TrainingCheckpoint
+        resumed exactly, a folder of another training or one that cannot be written to, a second TrainingCheckpoint, or a
+        model whose class its module does not have
     """
 
     def __init__(self, save_freq: int, path: str | Path, keep: int = 2, exact: bool = True):
@@ -147,6 +151,7 @@ class TrainingCheckpoint(BaseCallback):
                 f"TrainingCheckpoint is for on-policy and off-policy algorithms, got {type(self.model).__name__}, which has "
                 "no rollouts"
             )
+        _check_class(type(self.model))
         if self._resumed is not None:
             # Before other callbacks change hyperparameters when training starts
             check_same(self._resumed.info["model"], describe_model(self.model), DIFFERENT)
@@ -261,12 +266,12 @@ class TrainingCheckpoint(BaseCallback):
             "num_timesteps": self.num_timesteps,
             "total_timesteps": self.model._total_timesteps,
             "seconds": self.seconds,
-            "algorithm": f"{type(self.model).__module__}:{type(self.model).__qualname__}",
+            "algorithm": name_in_module(type(self.model)),
             "environment": self._environment,
             "model": describe_model(self.model),
             "device": str(self.model.device),
             "callbacks": describe_callbacks(self._parts.callbacks),
-            "learn": {name: self.locals[name] for name in ("log_interval", "tb_log_name", "progress_bar")},
+            "learn": {name: self.locals[name] for name in LEARN_ARGUMENTS if name in self.locals},
             "log": describe_log(self.model),
             "training_checkpoint": {"save_freq": self.save_freq, "keep": self.keep, "exact": self.exact},
             "left_out": left_out,
@@ -321,6 +326,18 @@ class TrainingCheckpoint(BaseCallback):
         if self._folder is not None:
             self._folder.close()
             self._folder = None
+
+
+def _check_class(algorithm: type[BaseAlgorithm]) -> None:
+    try:
+        is_found = find_named(name_in_module(algorithm)) is algorithm
+    except (AttributeError, ImportError):
+        is_found = False
+    if not is_found:
+        raise ValueError(
+            f"Training of {algorithm.__qualname__} could not be resumed, because there is no such class in its module "
+            f"{algorithm.__module__}: define it at the top level of the module"
+        )
 
 
 def _is_learning(model: BaseAlgorithm, frame: FrameType | None) -> bool:
