@@ -5,7 +5,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import set_random_seed
+from torch import nn
 
 from sb3_cchain import TaskSync
 from sb3_cchain.methods import LayerReset
@@ -157,6 +159,30 @@ def test_c_chain_forgets():
     assert remembered == [False, True, False, True]
 
 
+class Extractor(nn.Module):
+    """As SB3's manual shows for networks of one's own, with other names."""
+
+    latent_dim_pi = latent_dim_vf = 8
+
+    def __init__(self, n_features):
+        super().__init__()
+        self.actor, self.critic = nn.Linear(n_features, 8), nn.Linear(n_features, 8)
+
+    def forward(self, features):
+        return self.actor(features), self.critic(features)
+
+    def forward_actor(self, features):
+        return self.actor(features)
+
+    def forward_critic(self, features):
+        return self.critic(features)
+
+
+class PolicyWithoutParts(ActorCriticPolicy):
+    def _build_mlp_extractor(self):
+        self.mlp_extractor = Extractor(self.features_dim)
+
+
 @pytest.mark.parametrize("name", ["PPO", "CChainDQN"])
 def test_before_the_first_reset_nothing_differs(name):
     models = [make_model(name, env=make_env()).learn(48, callback) for callback in (None, LayerReset(interval=10**9))]
@@ -173,6 +199,8 @@ def test_what_it_refuses():
         make_model("PPO", env=CountEnv()).learn(10, callback=LayerReset())
     with pytest.raises(TypeError, match=r"does not know heads for plasticity injection, got InjectionPolicy"):
         make_model("PPO", policy=InjectionPolicy).learn(10, callback=LayerReset())
+    with pytest.raises(TypeError, match=r"LayerReset does not know the networks of PolicyWithoutParts: .*policy_net"):
+        make_model("PPO", policy=PolicyWithoutParts).learn(10, callback=LayerReset())
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,)))
     with pytest.raises(TypeError, match=r"LayerReset is for on-policy algorithms and DQN, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=LayerReset())

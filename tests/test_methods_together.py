@@ -20,6 +20,7 @@ from tests.method_models import (
     go_on,
     make_callback,
     make_env,
+    make_method,
     make_model,
     make_random_env,
     nested_optimizers,
@@ -105,6 +106,18 @@ def test_each_pair_trains_or_is_refused(number):
 def test_refused_pairs_are_of_the_registry():
     names = {method.name for method in PPO_METHODS}
     assert all(set(pair) <= names and tuple(sorted(pair)) == pair for pair in REFUSED)
+
+
+# Oracle's networks are all fresh; that of PlasticityInjection freezes by itself
+@pytest.mark.parametrize(
+    "method", [m for m in PPO_METHODS if m.name not in ("oracle", "plasticity_injection")], ids=lambda method: method.name
+)
+def test_frozen_layers_are_left_alone(method):
+    model, callbacks = make_method(method)
+    frozen = model.policy.mlp_extractor.policy_net.requires_grad_(False)
+    before = {name: value.clone() for name, value in frozen.state_dict().items()}
+    model.learn(4 * STEPS_PER_TASK, callbacks)
+    assert before and all(th.equal(value, before[name]) for name, value in frozen.state_dict().items())
 
 
 # AdamRel changes the optimiser, and is tested with the others below. PlasticityInjection needs a policy of its own,

@@ -34,6 +34,14 @@ class HiddenUnits:
     norms: dict[str, th.Tensor]
     has_weights: bool = True
 
+    def is_trained(self, network: nn.Module) -> bool:
+        """
+        :param network: The network
+        :return: Whether none of the weights into and out of the units is frozen
+        """
+        modules = [*([self.layer] if self.has_weights else []), *self.norms, *self.outgoing]
+        return all(parameter.requires_grad for name in modules for parameter in network.get_submodule(name).parameters())
+
 
 def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
     """

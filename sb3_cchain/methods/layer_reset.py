@@ -35,6 +35,7 @@ class LayerReset(SwitchOrInterval):
       features extractor count, in the order of its modules.
     - DQN's target network gets the same draw. The paper's text does not fix this for all of its agents; it is assumed here,
       so that targets do not pull the fresh layer back to the old one.
+    - Frozen layers count and are left alone.
     - The standard deviation of Gaussian actions (``log_std``) is in no layer and stays:
       :class:`~sb3_cchain.methods.LogStdRestart` restarts it.
 
@@ -50,7 +51,8 @@ class LayerReset(SwitchOrInterval):
     :raises ValueError: When an argument is neither None nor a positive integer; when training starts, when a network has fewer
         layers than ``n_layers``
     :raises TypeError: When training starts, for an algorithm that is neither on-policy nor DQN, for recurrent networks, for
-        the policies of :class:`PlasticityInjection`, and with ``interval=None`` for an environment that is not continual
+        the policies of :class:`PlasticityInjection`, for networks that are not made of SB3's parts, and with
+        ``interval=None`` for an environment that is not continual
     """
 
     name = "layer_reset"
@@ -65,7 +67,11 @@ class LayerReset(SwitchOrInterval):
 
     def _init_callback(self) -> None:
         check_plain_networks("LayerReset", self.model)
-        n_layers = min(map(len, network_layers(uncompiled(self.model.policy))))
+        policy = uncompiled(self.model.policy)
+        try:
+            n_layers = min(map(len, network_layers(policy)))
+        except AttributeError as error:
+            raise TypeError(f"LayerReset does not know the networks of {type(policy).__name__}: {error}") from error
         if self.n_layers is not None and self.n_layers > n_layers:
             raise ValueError(f"`n_layers` must be at most {n_layers}, the layers of the network, got {self.n_layers!r}")
 
@@ -76,7 +82,9 @@ class LayerReset(SwitchOrInterval):
 def network_layers(policy: nn.Module) -> list[list[list[str]]]:
     """
     :param policy: A policy of an on-policy algorithm or of DQN
-    :return: For each of its trained networks, for each layer in the order of the data, the names of its parameters and buffers
+    :return: For each of its trained networks, for each layer in the order of the data, the names of its parameters and
+        buffers, none of a frozen layer
+    :raises AttributeError: For networks that are not made of SB3's parts
     """
     networks = [("q_net",)] if hasattr(policy, "q_net") else [_ACTOR, _CRITIC]
     found = []
@@ -86,10 +94,13 @@ def network_layers(policy: nn.Module) -> list[list[list[str]]]:
             for name, module in policy.get_submodule(part).named_modules(prefix=part):
                 if isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)):
                     layers.append([])
-                own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
+                parameters = dict(module.named_parameters(recurse=False))
+                if parameters and not any(parameter.requires_grad for parameter in parameters.values()):
+                    continue  # frozen
+                own = [*parameters, *dict(module.named_buffers(recurse=False))]
                 if own and not layers:
                     layers.append([])  # a norm or an embedding before the first layer
-                for key, _ in own:
+                for key in own:
                     layers[-1].append(f"{name}.{key}")
         found.append(layers)
     return found

@@ -35,8 +35,8 @@ class PlasticityInjection(TaskBoundary):
     the same new parameters at the same time, so that its outputs do not change either. A second injection is not offered.
 
     It happens between rollouts, so up to a rollout late. C-CHAIN's reference stays, because the outputs do. Frozen parameters
-    have no gradient and are left alone by optimisers and by :class:`L2Init` and :class:`Parseval`; TRAC, weight clipping
-    and shrink-and-perturb would move them. :class:`Oracle` undoes the injection, with everything else.
+    have no gradient and are left alone by optimisers and other methods. :class:`Oracle` undoes the injection, with everything
+    else.
 
     It costs one construction of the policy, and from then on about three times the forward pass of the head.
 

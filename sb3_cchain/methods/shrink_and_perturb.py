@@ -92,7 +92,8 @@ class ShrinkAndPerturb(TaskBoundary):
         with th.no_grad():
             for group, fresh_group in zip(self.model.policy.optimizer.param_groups, fresh.optimizer.param_groups, strict=True):
                 for parameter, draw in zip(group["params"], fresh_group["params"], strict=True):
-                    parameter.mul_(self.shrink).add_(draw, alpha=1 - self.shrink)
+                    if parameter.requires_grad:
+                        parameter.mul_(self.shrink).add_(draw, alpha=1 - self.shrink)
         self.n_steps += 1
 
     def _on_rollout_end(self) -> None:

@@ -28,7 +28,7 @@ class UnitRecycling(BaseCallback):
     """
     Base of callbacks that recycle hidden units of on-policy algorithms and DQN: incoming weights and bias are drawn again from
     the initialisation of the network, outgoing weights become 0, and so do Adam's moments of all these weights. Of DQN the
-    Q-network is meant; its target network follows by its usual updates.
+    Q-network is meant; its target network follows by its usual updates. Units with frozen weights are left alone.
     """
 
     name: ClassVar[str]  # prefix in the log
@@ -44,9 +44,12 @@ class UnitRecycling(BaseCallback):
         self.n_recycled: int = 0
         policy = uncompiled(self.model.policy)
         with evaluation_mode(policy):
-            self._layers = self._find_layers(policy, self._forward(_zeros(self.model)))
+            found = self._find_layers(policy, self._forward(_zeros(self.model)))
+        self._layers = [layer for layer in found if layer.is_trained(policy)]
         if not self._layers:
-            raise ValueError(f"{type(self).__name__} finds no hidden unit with outgoing weights of its own in {policy}")
+            raise ValueError(
+                f"{type(self).__name__} finds no hidden unit that is trained and has outgoing weights of its own in {policy}"
+            )
         if getattr(self, "_begun_with", None) is not self.model:
             self._begun_with = self.model
             self._begin()

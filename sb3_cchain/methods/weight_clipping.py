@@ -27,7 +27,7 @@ class WeightClipping(OptimizerWrapper):
     - the output layer is clipped like the others.
 
     A vector with no weight before it, such as the ``log_std`` of SB3's actor-critic policies, is left alone; the original
-    fails on it.
+    fails on it. So are frozen parameters.
 
     SB3's orthogonal initialisation (PPO and A2C, gain √2) exceeds b in many of the entries. With κ near 1, set
     ``ortho_init=False``, as the C-CHAIN paper's Gym Control does.
@@ -67,7 +67,8 @@ class WeightClipping(OptimizerWrapper):
     def _step(self) -> None:
         super()._step()
         for parameter, bound in zip(self.parameters(), self.bounds(), strict=True):
-            parameter.clamp_(-bound, bound)
+            if parameter.requires_grad:
+                parameter.clamp_(-bound, bound)
 
     @th.no_grad()
     def metrics(self) -> dict[str, float]:
