@@ -175,6 +175,21 @@ def test_c_chain_forgets():
     assert seen == [(0, True), (1, False), (0, True), (1, False)]
 
 
+def test_no_minibatch_of_the_old_task_waits_when_the_replay_buffer_was_emptied():
+    model, tasks = make_model("CChainDQN", churn_reference="next"), {}
+    td_loss = model._td_loss
+
+    def watched_td_loss(replay_data, *args):
+        tasks.setdefault(model.num_timesteps > STEPS_PER_TASK, set()).update(
+            replay_data.observations.floor().flatten().tolist()
+        )
+        return td_loss(replay_data, *args)
+
+    model._td_loss = watched_td_loss
+    model.learn(2 * STEPS_PER_TASK, callback=Oracle(reset_replay_buffer=True))
+    assert tasks == {False: {0}, True: {1}}
+
+
 def test_c_chain_as_a_callback_forgets():
     model, c_chain, seen = make_model("PPO"), CChainCallback(churn_warmup=1), []
 

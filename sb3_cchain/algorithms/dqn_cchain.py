@@ -37,6 +37,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     of 50 can be so strong that nothing is learned.
 
     :param args: Arguments of DoubleDQN
+    :param churn_target: What is held still: ``"value"``, and ``"auto"`` is the same, because DQN has no policy of its own
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
         ``target_churn_ratio`` times the TD loss, or ``"auto_50"`` to use 50 (as the released code) instead of 1 during the
         warm-up. With 0 it is DoubleDQN, to the bit.
@@ -128,7 +129,8 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
         :param batch_size: Size of a further one
         :return: The minibatch to train on, and the next one
         """
-        if self._next_minibatch is not None:
+        # Whoever made the reducer forget its reference batch, such as Oracle, may have emptied the replay buffer, too
+        if self._next_minibatch is not None and self.churn_reducer.reference is not None:
             return self._next_minibatch, drawn
         self.churn_reducer.forget_reference()  # a saved model's: the minibatch that it belongs to is not saved
         assert self.replay_buffer is not None
