@@ -417,6 +417,7 @@ def test_one_coefficient_and_ratio_for_each_target():
         ("SAC", dict(churn_target="actor"), "`churn_target` must be one of 'auto', 'policy', 'value', 'both', got 'actor'"),
         ("SAC", dict(churn_coef={"policy": 1.0, "value": 1.0}), r"`churn_coef` must be one value or a dict with the keys"),
         ("SAC", dict(target_churn_ratio={"critic": 1.0}), "`target_churn_ratio` must be one value or a dict with the keys"),
+        ("PPO", dict(churn_coef={}), r"`churn_coef` must be one value or a dict .*, got \{\}"),
         ("DQN", dict(churn_target="both"), "`churn_target` of CChainDQN must be \"value\" .*no policy of its own.*'both'"),
         ("QRDQN", dict(churn_target="policy"), '`churn_target` of CChainQRDQN must be "value"'),
         ("TRPO", dict(churn_target="policy"), '`churn_target` of CChainTRPO must be "value" .its policy has no optimiser'),

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, transfer
 from sb3_cchain.analysis import NetworkHealth
 from sb3_cchain.methods import TRAC, Oracle
-from sb3_cchain.networks import LayerNormPolicy
+from sb3_cchain.networks import InjectionPolicy, LayerNormPolicy
 from tests.envs import RandomEnv
 
 ON_POLICY = dict(n_steps=16, batch_size=8, n_epochs=1)
@@ -226,6 +226,12 @@ def test_pictures_of_another_number_of_channels():
             "CartPole-v1",
             ValueError,
             "PPO was made with `use_sde=True`, which needs Box actions",
+        ),
+        (
+            lambda: PPO(InjectionPolicy, "CartPole-v1", **ON_POLICY),
+            "CartPole-v1",
+            TypeError,
+            r"transfer\(\) does not know heads for plasticity injection, got InjectionPolicy",
         ),
         (
             lambda: PPO("MlpPolicy", "CartPole-v1", **ON_POLICY),

@@ -244,7 +244,7 @@ class ChurnArguments:
         check_choice("churn_target", self.churn_target, CHURN_TARGETS)
         for argument in ("churn_coef", "target_churn_ratio"):
             value = getattr(self, argument)
-            if isinstance(value, dict) and not set(value) <= {"policy", "value"}:
+            if isinstance(value, dict) and not (value and set(value) <= {"policy", "value"}):
                 raise ValueError(f"`{argument}` must be one value or a dict with the keys 'policy' and 'value', got {value!r}")
         for name in ("policy", "value"):
             self.make_coefficient(name, _ANY, default_target_ratio=1.0)

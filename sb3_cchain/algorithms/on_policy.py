@@ -102,7 +102,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
     - ``churn/policy_churn``: L_churn minus its value without any churn; for discrete actions the Kullback-Leibler
       divergence from the policy before an update to the one after it
     - ``churn/value_churn``: mean absolute change of the state values by an update. Of a PPO that holds only its policy still,
-      by the first update of each epoch, unless it is the epoch's only one, on the first 32 samples of its reference batch
+      by the first update of each epoch, unless no update follows it, on the first 32 samples of its reference batch
 
     With two targets, what belongs to one is logged as ``churn/policy/…`` or ``churn/value/…``. L is averaged over the updates.
     With ``churn_base_loss="last"``, L and ``churn/loss`` are those of the last update.

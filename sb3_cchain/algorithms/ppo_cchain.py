@@ -36,11 +36,14 @@ class CChainPPO(ChurnAlgorithm, PPO):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param args: Further arguments of PPO
+    :param churn_target: What is held still: ``"policy"``, which ``"auto"`` is, too, the state ``"value"``, or ``"both"``.
+        Without ``"policy"``, ``churn_base_loss`` has no effect.
     :param churn_coef: λ, the weight of the churn loss: a number, ``"auto"`` to keep the churn loss at
         ``target_churn_ratio`` times ``churn_base_loss``, or ``"auto_10"`` to use 10 instead of 1 during the warm-up.
-        With 0 it is PPO, to the bit.
+        With 0 it is PPO, to the bit. One for all targets, or a dict, ``{"policy": ..., "value": ...}``.
     :param target_churn_ratio: β, the size of λ·L_churn relative to that loss. ``"auto"`` is 1e4 for discrete actions
-        (the paper takes the best of 1e3, 1e4 and 1e5) and 0.05 for continuous ones (the paper: 0.05 or 0.5).
+        (the paper takes the best of 1e3, 1e4 and 1e5), 0.05 for continuous ones (the paper: 0.05 or 0.5) and 0.01 for values.
+        One for all targets, or a dict.
     :param churn_warmup: Iterations (rollout and ``train()``) until λ adapts
     :param churn_window: Iterations that the running means of both losses cover
     :param churn_coef_min: Least value of λ once it adapts

@@ -77,8 +77,8 @@ class ChurnReducer(nn.Module):
         :param reference: Observations outside the minibatch of the update that is about to be made
         :param backward: Takes λ·L_churn and adds its gradient
         :return: The present outputs on the reference batch of the update before; None where there is none
-        :raises ValueError: When the churn loss, or λ times it, is NaN or infinite, or the reference batch is empty. The
-            parameters and their gradients have not been touched.
+        :raises ValueError: When the churn loss, or λ times it, is NaN or infinite; the parameters and their gradients have not
+            been touched. When the reference batch is empty.
         """
         outputs = None
         if self.reference is not None:

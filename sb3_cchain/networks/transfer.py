@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import nn
 
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.validation import check_bool
 
 # Attributes that callbacks keep with a model: the state of churn reduction, and the parameters that training began with
@@ -51,12 +52,14 @@ def transfer(model: BaseAlgorithm, env: GymEnv | str, new_heads: bool = True) ->
     :param env: The environment to train in next (if registered in Gym, can be str)
     :param new_heads: Whether the heads are drawn anew even where they fit
     :return: The names of what was kept and of what is new
-    :raises TypeError: For a model of another algorithm
+    :raises TypeError: For a model of another algorithm, and for a policy that plasticity can be injected into
     :raises ValueError: When the model cannot act in the environment, or no layer between its observations and the heads can be
         kept. The model is then as it was
     """
     if not isinstance(model, (PPO, A2C, DQN)):
         raise TypeError(f"`model` must be of PPO, A2C, DQN or a class that derives from them, got {type(model).__name__}")
+    if any(isinstance(module, Injectable) for module in model.policy.modules()):
+        raise TypeError(f"transfer() does not know heads for plasticity injection, got {type(model.policy).__name__}")
     check_bool("new_heads", new_heads)
     env = model._wrap_env(maybe_make_env(env, model.verbose), model.verbose)
     _check_spaces(model, env)
