@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecNormalize
 
-from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.envs import TaskVecNormalize
 from tests.envs import CountEnv, RandomEnv
 
@@ -104,6 +104,18 @@ def test_the_discounted_return_over_cuts(returns_over_cuts):
         begins_new = in_task in (14, 20) or (in_task == 7 and not returns_over_cuts)
         discounted = 0.0 if begins_new else 0.5 * discounted + 1.0
         assert (count, env.returns[0]) == (count, pytest.approx(discounted))
+
+
+def test_the_discounted_return_starts_over_at_a_switch_within_an_episode():
+    class Returns(BaseCallback):
+        def _on_step(self):
+            returns.append(self.training_env.returns[0])
+            return True
+
+    env, returns = TaskVecNormalize(DummyVecEnv([lambda: CountEnv(length=100)]), gamma=0.5), []
+    CChainPPO("MlpPolicy", env, **SETTINGS).learn(16, [TaskSignal(switch_at=[8]), Returns()])
+    before = [2 - 0.5**step for step in range(9)]  # the restart is in the step after the signal's word
+    assert returns == pytest.approx([*before[:8], 0.0, *before[:7]])
 
 
 @pytest.mark.parametrize(

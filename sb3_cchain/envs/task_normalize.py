@@ -126,7 +126,7 @@ class TaskVecNormalize(VecNormalize):
         observations = self.normalize_obs(self.old_obs)
         if not switch:
             self._normalize_terminal(dones, infos)
-        self.returns[dones if switch else self._ends_return(dones, infos)] = 0
+        self.returns[switch | self._ends_return(dones, infos)] = 0
         return observations, rewards, dones, infos
 
     def _follows_tasks(self) -> bool:
