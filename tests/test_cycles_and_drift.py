@@ -81,6 +81,16 @@ def test_a_task_that_training_begins_with_or_is_pinned_to_does_not_drift():
     assert offsets_of(env, 3) == close_to([10, 15, 20])
 
 
+def test_a_task_goes_on_drifting_where_it_was_left():
+    env = drifting()
+    env.unwrapped.set_clock(21)
+    assert offsets_of(env, 1) == close_to([15])
+    env.unwrapped.set_clock(12)
+    assert offsets_of(env, 1) == close_to([5])
+    env.unwrapped.set_clock(21)
+    assert offsets_of(env, 1) == close_to([15])
+
+
 def test_steps_count_over_all_environments():
     assert offsets_of(drifting(n_envs=2), 9)[5:] == close_to([0, 5, 10, 10])
 

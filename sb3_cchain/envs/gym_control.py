@@ -105,8 +105,8 @@ class ContinualGymControl(ContinualEnv):
         else:
             self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
-        # What is missing to the task's own offset. Added here, so that the tasks themselves stay as they are
-        self._missing_offset = np.zeros_like(self.offsets[0])
+        # What is missing to a task's own offset, by task. Added here, so that the tasks themselves stay as they are
+        self._missing_offsets: dict[int, NDArray[np.float32]] = {}
         super().__init__(
             tasks,
             steps_per_task,
@@ -127,7 +127,7 @@ class ContinualGymControl(ContinualEnv):
         :param weight: 0 for the offset of the task before, 1 for that of the present task
         """
         before, own = (self.offsets[task % len(self.offsets)] for task in (self.task_id - 1, self.task_id))
-        self._missing_offset = ((1 - weight) * (before - own)).astype(np.float32)
+        self._missing_offsets[self.task_id] = ((1 - weight) * (before - own)).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
         """
@@ -148,7 +148,7 @@ class ContinualGymControl(ContinualEnv):
 
     def _drifting(self, observation: NDArray[Any]) -> NDArray[Any]:
         is_itself = not self.blend_steps or self._weights.get(self.task_id, 1.0) == 1
-        return observation if is_itself else observation + self._missing_offset
+        return observation if is_itself else observation + self._missing_offsets[self.task_id]
 
 
 def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
