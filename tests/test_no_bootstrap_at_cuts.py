@@ -6,7 +6,7 @@ from gymnasium.wrappers import TimeLimit
 from sb3_contrib import ARS
 from stable_baselines3 import DQN, PPO
 
-from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.callbacks import NoBootstrapAtCuts
 from tests.envs import RandomEnv
 
@@ -41,6 +41,15 @@ def test_nothing_stands_for_the_rest_of_an_episode(algorithm, callbacks, added):
 def test_at_a_switch_too():
     rewards = rollout_rewards(PPO, ContinualEnv([Ones, Ones], 8), [TaskSync(), NoBootstrapAtCuts()])
     assert rewards == [1.0] * 16
+
+
+def test_metrics_see_the_cut():
+    model = CChainPPO("MlpPolicy", ContinualEnv([Ones, Ones], 32), n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+    model.learn(64, [TaskSignal(), NoBootstrapAtCuts()])
+    assert [(row["task_id"], row["n_episodes"], row["mean_return"]) for row in model.continual_returns] == [
+        (0, 0, 1),
+        (1, 0, 1),
+    ]
 
 
 def test_off_policy():

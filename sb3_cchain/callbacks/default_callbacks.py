@@ -14,14 +14,16 @@ def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> l
     """
     :param given: The callbacks of ``learn()``
     :param env: The training environment
-    :return: The same, in a continual environment preceded by TaskSync and ContinualMetrics; with a TaskSignal among them,
-        followed by ContinualMetrics in any environment. What is already there is not added.
+    :return: The same, in a continual environment preceded by TaskSync and ContinualMetrics. With a TaskSignal among them,
+        ContinualMetrics is right behind it, in any environment. What is already there is not added.
     """
-    present = list(iterate_callbacks(CallbackList(given)))
 
-    def has(kind: type[BaseCallback]) -> bool:
-        return any(isinstance(callback, kind) for callback in present)
+    def has(kind: type[BaseCallback], callbacks: list[BaseCallback]) -> bool:
+        return any(isinstance(callback, kind) for callback in iterate_callbacks(CallbackList(callbacks)))
 
-    sync = [TaskSync()] if is_continual(env) and not has(TaskSync) else []
-    metrics = [ContinualMetrics()] if (is_continual(env) or has(TaskSignal)) and not has(ContinualMetrics) else []
-    return [*sync, *given, *metrics] if has(TaskSignal) else [*sync, *metrics, *given]
+    sync = [TaskSync()] if is_continual(env) and not has(TaskSync, given) else []
+    has_signal = has(TaskSignal, given)
+    metrics = [ContinualMetrics()] if (is_continual(env) or has_signal) and not has(ContinualMetrics, given) else []
+    # Callbacks behind it may change what a step has told, as NoBootstrapAtCuts does
+    n_before = next((n for n in range(len(given) + 1) if has(TaskSignal, given[:n])), 0)
+    return [*sync, *given[:n_before], *metrics, *given[n_before:]]
