@@ -181,6 +181,14 @@ def test_statistics_that_restart_at_the_switch_are_those_of_the_task_before():
     assert callback.counts == [1, 32, 32, 17]
 
 
+def test_training_that_ends_at_a_switch_has_the_statistics_of_its_task():
+    env, eval_env = (TaskVecNormalize(make_vec_env(tasks)) for _ in range(2))
+    callback, model = Means(eval_env, n_eval_episodes=1), PPO("MlpPolicy", env, **ARGUMENTS)
+    for _ in range(2):
+        model.learn(32, [TaskSync(), callback], reset_num_timesteps=False)
+    assert callback.counts == [1, 32, 32]
+
+
 def test_resumed_training_goes_on_with_the_rows(tmp_path):
     model, rows = evaluate(tmp_path / "all.csv", total=64)
     model.save(tmp_path / "model")

@@ -1,7 +1,6 @@
 """After interrupted training no callback goes on acting, neither in training without it nor in that of another model."""
 
 import inspect
-import types
 
 import pytest
 import torch as th
@@ -78,8 +77,7 @@ def attached(model):
     ]
     hooks += [hook for m in model.policy.modules() for hook in (*m._forward_hooks.values(), *m._forward_pre_hooks.values())]
     owners = (model, model.policy, model.env, getattr(model, "rollout_buffer", None))
-    functions = (types.FunctionType, types.MethodType)
-    return hooks + [name for o in owners if o for name, value in vars(o).items() if isinstance(value, functions)]
+    return hooks + [name for o in owners if o for name in vars(o) if callable(getattr(type(o), name, None))]
 
 
 @pytest.mark.parametrize("algorithm, where", [("PPO", "update"), ("DQN", "update"), ("PPO", "step")])
@@ -111,6 +109,25 @@ def test_training_without_the_callback_is_plain_training(tmp_path, monkeypatch, 
     for parameter, other in zip(model.policy.parameters(), plain.policy.parameters(), strict=True):
         assert th.equal(parameter, other)
     assert attached(model) == before
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_the_end_of_training_may_be_told_twice(tmp_path, monkeypatch, name, algorithm):
+    """As RL Zoo does with the first callback, also when training did not start."""
+    monkeypatch.chdir(tmp_path)
+    settings = dict(normalize_advantage=False) if algorithm == "PPO" else {}
+    model, callback = make_model(algorithm, **settings), make_callback(name)
+    try:
+        model.learn(64, callback=[callback, *([] if name == "TaskSync" else [TaskSync()])])
+    except (TypeError, AssertionError):
+        callback.on_training_end()
+        return
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
+    kept = {name: len(value) for name, value in vars(model).items() if isinstance(value, list)}
+    callback.on_training_end()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.csv")} == before
+    assert {name: len(value) for name, value in vars(model).items() if isinstance(value, list)} == kept
 
 
 def test_when_training_begins_again_and_reaches_the_same_step():

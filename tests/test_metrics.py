@@ -192,6 +192,29 @@ def test_the_reward_per_step_is_the_return_of_a_task_without_ends(tmp_path):
     assert path.read_text().splitlines()[1:] == ["32,0,0,1.0", *finished, "96,2,0,3.0"]
 
 
+class BackAgain(CountEnv):
+    """Tasks 0, 1 and 0 again, of 32 steps each. From then on no episode ends."""
+
+    n_steps_so_far = 0
+
+    def step(self, action):
+        self.n_steps_so_far += 1
+        observation, reward, is_end, *_ = super().step(action)
+        task_id = (self.n_steps_so_far - 1) // 32
+        return observation, reward, is_end and task_id < 2, False, {"task_id": task_id % 2}
+
+
+def test_a_task_that_comes_again_keeps_the_rows_of_its_first_visit(tmp_path):
+    path, model = tmp_path / "returns.csv", PPO("MlpPolicy", BackAgain(length=8), **SETTINGS)
+    first_visits = ["16,0,2,8.0", "32,0,2,8.0", "48,1,2,8.0", "64,1,2,8.0"]
+    for n_steps, end in ((80, 80), (16, 96)):
+        metrics = ContinualMetrics(path)
+        model.learn(n_steps, metrics, reset_num_timesteps=False)
+        metrics.on_training_end()  # as RL Zoo does once more
+        assert path.read_text().splitlines()[1:] == [*first_visits, f"{end},0,0,1.0"]
+    assert len(model.continual_returns) == 5
+
+
 def test_an_episode_that_a_switch_cuts_counts_where_others_ended(tmp_path):
     path = tmp_path / "returns.csv"
     env = ContinualEnv([lambda: CountEnv(length=10)] * 2, 16)

@@ -76,6 +76,8 @@ class TaskEvaluation(BaseCallback):
         self.path: Path | None = None if path is None else Path(path)
         self._file: ReturnsFile | None = None
         self._last_step = 0
+        # Of the last rollout, whose task is evaluated when training ends
+        self._trained_task: int | None = None
 
     def _init_callback(self) -> None:
         require_continual(self)
@@ -101,7 +103,7 @@ class TaskEvaluation(BaseCallback):
         path = self.path or (folder / self.file_name if folder is not None else None)
         self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new, columns=self.columns)
         self._switch = TaskSwitch()
-        self._trained_task: int | None = None
+        self._trained_task = None
         self._last_step = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
@@ -120,8 +122,10 @@ class TaskEvaluation(BaseCallback):
 
     def _on_training_end(self) -> None:
         if self._trained_task is not None:
-            self._evaluate(self._trained_task)
+            # The environment may have begun the next task already
+            self._evaluate(self._trained_task, at_switch=first_reset_info(self.training_env)[TASK_KEY] != self._trained_task)
             self.logger.dump(self.num_timesteps)
+            self._trained_task = None  # RL Zoo tells the first callback twice that training has ended
         if self._file is not None:
             self._file.close()
 

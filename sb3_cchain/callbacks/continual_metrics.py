@@ -75,6 +75,7 @@ class ContinualMetrics(BaseCallback):
         self._finished: dict[int, list[float]] = defaultdict(list)
         self._endless: dict[int, float] = {}
         self._file: ReturnsFile | None = None
+        self._is_training = False
 
     def _on_training_start(self) -> None:
         start_listening(self, needs_switches=False)
@@ -102,10 +103,11 @@ class ContinualMetrics(BaseCallback):
         goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
         if not goes_on and state["n_episodes"] == 0:
             state["n_steps"] = 0  # its row is written
+        present = (self.num_timesteps, state["task_id"], 0) if goes_on else None
         self.rows = [
             row
             for row in past
-            if row["timesteps"] <= self.num_timesteps and not (goes_on and row["task_id"] == state["task_id"])
+            if row["timesteps"] <= self.num_timesteps and (row["timesteps"], row["task_id"], row["n_episodes"]) != present
         ]
         self.model.continual_returns = self.rows  # type: ignore[attr-defined]
         self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new)
@@ -115,6 +117,7 @@ class ContinualMetrics(BaseCallback):
 
         self._vec_normalize = self.model.get_vec_normalize_env()
         self._rollout_reward, self._rollout_steps = 0.0, 0
+        self._is_training = True
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], self.locals["dones"]
@@ -214,6 +217,9 @@ class ContinualMetrics(BaseCallback):
             self._endless[state["task_id"]] = state["reward"] / state["n_steps"]
 
     def _on_training_end(self) -> None:
+        if not self._is_training:  # RL Zoo tells the first callback twice that training has ended
+            return
+        self._is_training = False
         self._close_task()
         self._take_rows()
         if self._file is not None:
