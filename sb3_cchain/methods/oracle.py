@@ -20,9 +20,9 @@ class Oracle(TaskBoundary):
     nothing over from one task to the next; it is the oracle of the C-CHAIN paper (https://arxiv.org/abs/2506.00592, Section
     5).
 
-    The parameters become a fresh draw of their initialisation, the same one for the target network. The optimiser becomes that
-    of a fresh model, without moments or steps. C-CHAIN, where the model has it, forgets its reference batch and the history of
-    λ. No object is replaced.
+    The parameters, frozen ones too, become a fresh draw of their initialisation, the same one for the target network. The
+    optimiser becomes that of a fresh model, without moments or steps. C-CHAIN, where the model has it, forgets its reference
+    batch and the history of λ. No object is replaced.
 
     It happens between rollouts. When tasks last for whole rollouts, that is before the first action in the new task. Otherwise
     it is up to a rollout late: the rollout that has data of both tasks trains the network that is then dropped.
