@@ -450,7 +450,7 @@ def test_a_coefficient_that_can_do_nothing_is_warned_of_once():
 def test_defaults_are_the_tables():
     expected = {
         "policy": {"PPO": 1e4, "MaskablePPO": 1e2, "RecurrentPPO": 1e2, "A2C": 10, "SAC": 5e-5, "TD3": 5e-5},
-        "value": {"TRPO": 1e-3, "QRDQN": 0.01},
+        "value": {"TRPO": 1e-3, "QRDQN": 1e-3},
     }
     for target, ratios in expected.items():
         for name, ratio in ratios.items():

@@ -135,7 +135,7 @@ _OF_POLICIES: dict[Divergence, float] = {cross_entropy: 1e4, mean_squared_differ
 # (docs/results/family.md)
 _OF_MASKED_AND_RECURRENT: dict[Divergence, float] = {cross_entropy: 1e2, mean_squared_difference: 0.05}
 _OF_VALUES: dict[Divergence, float] = {mean_squared_difference: 0.01}
-# Where 0.01 made learning slower, or in some seeds worse (docs/modules/family.md)
+# Where 0.01 made learning slower, or in some seeds worse, or stopped it after a switch (docs/modules/family.md)
 _OF_SENSITIVE_VALUES: dict[Divergence, float] = {mean_squared_difference: 1e-3}
 # A2C's policy loss, of advantages that are not normalised, is about a hundred times PPO's clipped surrogate, which is near 0.
 # With PPO's β it learns nothing (docs/modules/family.md)
@@ -197,7 +197,9 @@ KINDS = {
         {"value": ChurnTarget(action_values, {"train/loss": None}, _OF_VALUES)}, "value", without_policy=_NO_POLICY
     ),
     "QRDQN": ChurnKind(
-        {"value": ChurnTarget(action_quantiles, {"train/loss": None}, _OF_VALUES)}, "value", without_policy=_NO_POLICY
+        {"value": ChurnTarget(action_quantiles, {"train/loss": None}, _OF_SENSITIVE_VALUES)},
+        "value",
+        without_policy=_NO_POLICY,
     ),
     **dict.fromkeys(("SAC", "TQC", "CrossQ", "TD3"), _ACTOR_CRITIC),  # DDPG is a TD3
 }
