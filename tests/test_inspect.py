@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.__main__
-from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
-from sb3_cchain.analysis import NetworkHealth
+from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
+from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, NetworkHealth
 from sb3_cchain.analysis.inspection import inspect_model, report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 
 OF_PPO = dict(n_steps=32, batch_size=16)
 OF_DQN = dict(learning_starts=10, buffer_size=100)
@@ -115,6 +117,32 @@ def test_task_of_a_continual_environment(algorithm, tmp_path, monkeypatch, capsy
         assert message in capsys.readouterr().err
 
 
+def make_continual_env():
+    return make_vec_env("Continual/CartPole-v1", env_kwargs=dict(n_tasks=3, steps_per_task=32))
+
+
+@pytest.mark.parametrize(
+    "make_callback",
+    [
+        lambda folder: ContinualMetrics(folder / "returns.csv"),
+        lambda folder: EvalAllTasks(make_continual_env(), n_eval_episodes=1, path=folder / "returns.csv"),
+        lambda folder: EvalTrainedTask(make_continual_env(), n_eval_episodes=1, path=folder / "returns.csv"),
+        lambda folder: EvalCallback(make_continual_env(), eval_freq=16, best_model_save_path=str(folder), verbose=0),
+        lambda folder: CheckpointCallback(16, str(folder)),
+        lambda folder: TrainingCheckpoint(16, folder, exact=False),
+    ],
+    ids=["ContinualMetrics", "EvalAllTasks", "EvalTrainedTask", "EvalCallback", "CheckpointCallback", "TrainingCheckpoint"],
+)
+def test_the_files_of_the_training_stay_as_they_are(make_callback, tmp_path):
+    def content():
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    model = make(PPO, make_continual_env()).learn(64, callback=[TaskSync(), make_callback(tmp_path)])
+    before = content()
+    inspect_model(model, callbacks=[make_callback(tmp_path)])
+    assert before and content() == before
+
+
 @pytest.mark.parametrize("option", ["--n-steps", "--n-updates"])
 def test_numbers_are_checked_before_work_starts(option, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
@@ -130,6 +158,7 @@ def test_model_of_rl_zoo(tmp_path, monkeypatch):
         "  policy: MlpPolicy\n  n_timesteps: 64\n  n_envs: 2\n  n_steps: 32\n  batch_size: 32\n  normalize: True\n"
         "  env_wrapper:\n    - sb3_cchain.envs.RewardScale:\n        scale: 0.5\n"
         "  callback:\n    - sb3_cchain.callbacks.EpisodicRollouts\n    - sb3_cchain.ChurnMonitor\n"
+        f"    - rl_zoo3.callbacks.SaveVecNormalizeCallback:\n        save_freq: 16\n        save_path: {tmp_path}/statistics\n"
         "  normalize_advantage: False\n"
     )
     monkeypatch.setattr(

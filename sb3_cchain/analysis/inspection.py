@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -24,6 +24,9 @@ from sb3_cchain.analysis.ntk import has_ntk
 from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
+from sb3_cchain.analysis.task_evaluation import TaskEvaluation
+from sb3_cchain.callbacks import ContinualMetrics
+from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.signal import is_continual
@@ -43,6 +46,8 @@ GROUP_FIGURES = (
 )
 
 _MONITORS = (ChurnMonitor, Doctor, NetworkHealth, NTKCallback)
+# Training does not depend on them, and they would write to the files of the training
+_WRITERS = (CheckpointCallback, ContinualMetrics, EvalCallback, TaskEvaluation, TrainingCheckpoint)
 
 # Iterations or episodes until the logger is emptied
 _NEVER = 10**9
@@ -109,7 +114,7 @@ def inspect_model(
     :param name: What it is called in reports
     :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
     :param n_updates: Gradient updates, for off-policy algorithms
-    :param callbacks: Callbacks of its training on which the training depends
+    :param callbacks: Callbacks of its training. Those that only evaluate or write files are left out
     :return: What was found
     :raises ValueError: Naming the argument that is out of its range; for a model without an environment
     """
@@ -143,7 +148,7 @@ def inspect_model(
     if ntk is not None:
         monitors.append(ntk)
     # The monitors that it was trained with are replaced by those above
-    others = [callback for callback in callbacks if not isinstance(callback, _MONITORS)]
+    others = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS))]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
         others.insert(0, TaskSync())
     try:

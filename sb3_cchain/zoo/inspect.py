@@ -13,6 +13,7 @@ import gymnasium as gym
 import yaml
 from rich.console import Console
 from rl_zoo3 import ALGOS
+from rl_zoo3.callbacks import SaveVecNormalizeCallback
 from rl_zoo3.utils import StoreDict, create_test_env, get_callback_list, get_saved_hyperparams
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import is_masking_supported
@@ -50,7 +51,8 @@ def make_as_trained(
     read_saved(folder / "config.yml")  # for its errors
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
-    callbacks = get_callback_list(hyperparams)
+    # RL Zoo's own callback that writes files; inspect_model() leaves out all others
+    callbacks = [each for each in get_callback_list(hyperparams) if not isinstance(each, SaveVecNormalizeCallback)]
     env = create_test_env(
         env_id,
         n_envs,
