@@ -315,6 +315,13 @@ def test_what_is_filmed_keeps_the_wrappers_of_the_settings(settings, wrapper):
     assert env.env_is_wrapped(wrapper) == env.env_is_wrapped(TaskCaption) == [True]
 
 
+@pytest.mark.parametrize("create", [zoo.create_env, zoo.create_captioned_env])
+def test_what_is_filmed_or_pushed_has_the_arguments_of_the_settings(create):
+    settings = dict(env_kwargs=dict(n_tasks=2, steps_per_task=7))
+    env = create("Continual/CartPole-v1", hyperparams=settings, env_kwargs=dict(steps_per_task=5, render_mode="rgb_array"))
+    assert env.get_attr("n_tasks") == [2] and env.get_attr("steps_per_task") == [[5, 5]]
+
+
 def test_record_training_records_by_our_command(tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(subprocess, "run", lambda command: started.append(command) or subprocess.CompletedProcess(command, 0))

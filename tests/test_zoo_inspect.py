@@ -240,13 +240,20 @@ def test_a_page_that_cannot_be_written(tmp_path, capsys):
         assert message in error_of(capsys, tmp_path / "model.zip", "--output", tmp_path, "--html", page)
 
 
-def test_arguments_that_rl_zoo_saved_are_used(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "file, arguments",
+    [
+        ("args.yml", ["--env-kwargs", "n_tasks:2", "offsets:[[0.0]*4,[0.5]*4]", *SHORT_PPO]),
+        # As from a YAML file
+        ("config.yml", [*SHORT_PPO, "env_kwargs:dict(n_tasks=2, offsets=[[0.0]*4,[0.5]*4])"]),
+    ],
+)
+def test_arguments_that_rl_zoo_saved_are_used(file, arguments, tmp_path, monkeypatch):
     """Written by RL Zoo, read by our loader."""
-    env_kwargs = ("--env-kwargs", "n_tasks:2", "offsets:[[0.0]*4,[0.5]*4]")
-    options = ("--env", "Continual/CartPole-v1", "-n", "32", "-f", tmp_path, *FAST, *NO_EVALUATION, *env_kwargs)
-    command("train", "--algo", "ppo", *options, *SHORT_PPO)
+    options = ("--env", "Continual/CartPole-v1", "-n", "32", "-f", tmp_path, *FAST, *NO_EVALUATION)
+    command("train", "--algo", "ppo", *options, *arguments)
     (folder,) = tmp_path.glob("ppo/*_1")
-    saved = yaml.load((folder / "Continual-CartPole-v1" / "args.yml").read_text(), yaml.UnsafeLoader)
+    saved = yaml.load((folder / "Continual-CartPole-v1" / file).read_text(), yaml.UnsafeLoader)
     assert saved["env_kwargs"]["n_tasks"] == 2
     monkeypatch.setattr(sb3_cchain.zoo.inspect, "inspect_model", lambda model, *_: (_ for _ in ()).throw(Started(model)))
     with pytest.raises(Started) as started:

@@ -74,18 +74,32 @@ def for_playing(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
 
 
-def create_captioned_env(env_id: str, hyperparams: dict[str, Any], **kwargs: Any) -> VecEnv:
+def create_env(env_id: str, hyperparams: dict[str, Any], env_kwargs: dict[str, Any], **kwargs: Any) -> VecEnv:
     """
-    RL Zoo's ``create_test_env``, with the task on each frame.
+    RL Zoo's ``create_test_env``, with the ``env_kwargs`` of the settings, too. RL Zoo adds them in ``enjoy`` alone.
 
     :param env_id: Environment id
     :param hyperparams: Settings of the training
+    :param env_kwargs: Arguments of the environment, besides those of the settings
     :param kwargs: Other arguments of RL Zoo's
+    :return: The vectorised environment
+    """
+    env_kwargs = {**(hyperparams.get("env_kwargs") or {}), **env_kwargs}
+    return _create_test_env(env_id, hyperparams=hyperparams, env_kwargs=env_kwargs, **kwargs)
+
+
+def create_captioned_env(env_id: str, hyperparams: dict[str, Any], **kwargs: Any) -> VecEnv:
+    """
+    :func:`create_env`, with the task on each frame.
+
+    :param env_id: Environment id
+    :param hyperparams: Settings of the training
+    :param kwargs: Other arguments of :func:`create_env`
     :return: The vectorised environment
     """
     wrappers = hyperparams.get("env_wrapper") or []
     wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
-    return _create_test_env(env_id, hyperparams={**hyperparams, "env_wrapper": [*wrappers, TaskCaption]}, **kwargs)
+    return create_env(env_id, hyperparams={**hyperparams, "env_wrapper": [*wrappers, TaskCaption]}, **kwargs)
 
 
 def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
@@ -180,7 +194,7 @@ def run_module(name: str) -> None:
     with (
         replaced(subprocess, "call", call_sb3_cchain),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
-        replaced(rl_zoo3.utils, "create_test_env", create_captioned_env if name == "record_video" else _create_test_env),
+        replaced(rl_zoo3.utils, "create_test_env", create_captioned_env if name == "record_video" else create_env),
         working_clients() if name.endswith("_hub") else nullcontext(),
         warnings.catch_warnings(),
     ):

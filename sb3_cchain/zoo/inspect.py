@@ -47,8 +47,8 @@ def make_as_trained(
     :raises ValueError: When the YAML files beside the model are not as RL Zoo writes them
     """
     folder = model_path.parent / env_id.replace("/", "-")
-    env_kwargs = {**(read_saved(folder / "args.yml").get("env_kwargs") or {}), **env_kwargs}
-    read_saved(folder / "config.yml")  # for its errors
+    settings, options = (read_saved(folder / name).get("env_kwargs") for name in ("config.yml", "args.yml"))
+    env_kwargs = {**(settings or {}), **(options or {}), **env_kwargs}
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
     # RL Zoo's own callback that writes files; inspect_model() leaves out all others
