@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, ConvertCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_zip_file
 
@@ -141,6 +141,11 @@ def test_the_files_of_the_training_stay_as_they_are(make_callback, tmp_path):
     before = content()
     inspect_model(model, callbacks=[make_callback(tmp_path)])
     assert before and content() == before
+
+
+def test_a_callback_that_ends_the_training_at_once():
+    inspection = inspect_model(make(PPO), callbacks=[ConvertCallback(lambda *_: False)])
+    assert inspection.ntk is None and inspection.findings == [] and len(report([inspection])) == 1
 
 
 @pytest.mark.parametrize("option", ["--n-steps", "--n-updates"])

@@ -169,7 +169,7 @@ def inspect_model(
     }
     figures.update({f"health/{name}": norm for name, norm in health.gradient_norms().items()})
     figures.update(_rollout_figures(model.ep_info_buffer or [], n_steps))
-    matrix = None if ntk is None else ntk.matrix
+    matrix = getattr(ntk, "matrix", None)  # none, too, where a callback has ended the training before
     return Inspection(name, figures, matrix, parameters, **about, symptoms=doctor.symptoms, findings=doctor.findings)
 
 
