@@ -13,11 +13,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.__main__
-from sb3_cchain import CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
+import sb3_cchain.zoo.inspect
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, NetworkHealth
 from sb3_cchain.analysis.inspection import inspect_model, report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
+from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
+from sb3_cchain.methods import Oracle
 
 OF_PPO = dict(n_steps=32, batch_size=16)
 OF_DQN = dict(learning_starts=10, buffer_size=100)
@@ -141,6 +144,37 @@ def test_the_files_of_the_training_stay_as_they_are(make_callback, tmp_path):
     before = content()
     inspect_model(model, callbacks=[make_callback(tmp_path)])
     assert before and content() == before
+
+
+def n_losses(reduces_churn):
+    return int(reduces_churn.churn_reducer.coefficient.n_seen)
+
+
+@pytest.mark.parametrize(
+    "algorithm, make_callback, count, expected",
+    [
+        (PPO, Oracle, lambda _, callback: callback.n_resets, 0),
+        (DQN, lambda: TaskLearningStarts(100), lambda model, _: model._n_updates, 3),
+        # Of the last iteration, and of the inspection's
+        (CChainPPO, TaskSync, lambda model, _: n_losses(model), 2),
+        (PPO, lambda: CChainCallback(reset_churn_coef=True), lambda _, callback: n_losses(callback), 2),
+    ],
+    ids=["Oracle", "TaskLearningStarts", "CChainPPO", "CChainCallback"],
+)
+def test_to_choose_a_task_is_no_switch(algorithm, make_callback, count, expected, tmp_path, monkeypatch):
+    model = make(algorithm, make_continual_env())
+    model.reset_churn_coef = True
+    model.learn(64, callback=[TaskSync(), make_callback()]).save(tmp_path / "model.zip")
+    loaded, original = [], sb3_cchain.zoo.inspect.load_as_trained
+
+    def load(*args):
+        loaded.extend([original(*args)[0], make_callback()])
+        return loaded[0], loaded[1:]
+
+    monkeypatch.setattr("sb3_cchain.zoo.inspect.load_as_trained", load)
+    arguments = ("--env", "Continual/CartPole-v1", "--output", tmp_path, "--env-kwargs", "n_tasks:3")
+    inspect(monkeypatch, tmp_path / "model.zip", *arguments, "--task", 0, "--n-steps", 32, "--n-updates", 3)
+    assert count(*loaded) == expected
 
 
 def test_a_callback_that_ends_the_training_at_once():

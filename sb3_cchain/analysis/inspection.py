@@ -25,7 +25,7 @@ from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
 from sb3_cchain.analysis.task_evaluation import TaskEvaluation
-from sb3_cchain.callbacks import ContinualMetrics
+from sb3_cchain.callbacks import ContinualMetrics, TaskLearningStarts
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
@@ -114,7 +114,8 @@ def inspect_model(
     :param name: What it is called in reports
     :param n_steps: Environment steps to roll out, for off-policy algorithms; on-policy it is one rollout
     :param n_updates: Gradient updates, for off-policy algorithms
-    :param callbacks: Callbacks of its training. Those that only evaluate or write files are left out
+    :param callbacks: Callbacks of its training. Those that only evaluate or write files, and
+        :class:`~sb3_cchain.callbacks.TaskLearningStarts`, are left out
     :return: What was found
     :raises ValueError: Naming the argument that is out of its range; for a model without an environment
     """
@@ -147,8 +148,8 @@ def inspect_model(
     ntk = NTKCallback(interval=1, picture_interval=0) if has_ntk(model) else None
     if ntk is not None:
         monitors.append(ntk)
-    # The monitors that it was trained with are replaced by those above
-    others = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS))]
+    # The monitors that it was trained with are replaced by those above. TaskLearningStarts would put off the updates
+    others = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS, TaskLearningStarts))]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
         others.insert(0, TaskSync())
     try:

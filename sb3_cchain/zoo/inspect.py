@@ -286,6 +286,8 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
         where = f"{args.env} {env_kwargs}" if env_kwargs else args.env
         message = " ".join(str(error).split())  # in one line
         parser.exit(2, f"{parser.prog}: error: {path} in {where}: {message}\n")
+    if args.task is not None:
+        _forget_task(model, callbacks)
     if model.lr_schedule(model._current_progress_remaining) == 0:
         console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
     model.set_random_seed(args.seed)
@@ -294,6 +296,14 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
     assert model.env is not None
     model.env.close()
     return inspection
+
+
+def _forget_task(model: Any, callbacks: Sequence[Any]) -> None:
+    """The user's choice of a task is no switch, at which methods would act and λ would start over."""
+    model.trained_task_id = None
+    for each in (model, *callbacks):
+        if hasattr(each, "reset_churn_coef"):
+            each.reset_churn_coef = False
 
 
 def _write(args: argparse.Namespace, inspections: Sequence[Inspection]) -> list[Path]:
