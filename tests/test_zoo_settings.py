@@ -3,9 +3,11 @@
 import ast
 from collections import OrderedDict
 
+import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3 import DQN, PPO
 
 from benchmarks.grid.run import suite_methods
@@ -13,8 +15,9 @@ from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.envs.registration import CONTINUAL_ENVS, OTHER_ENVS
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
+from tests.envs import RandomEnv
 from tests.extras import NO_WHEELS
-from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, command, shipped_settings
+from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, SHORT_PPO, command, shipped_settings
 
 # Algorithms of which RL Zoo has no settings
 NEW_ALGOS = ["ppo_cchain", "dqn_cchain", "double_dqn"]
@@ -129,6 +132,17 @@ def test_c_chain_and_vanilla_differ_in_the_churn_arguments_alone():
 @pytest.mark.parametrize("algo", NEW_ALGOS)
 def test_defaults_hold_for_algorithms_that_rl_zoo_does_not_have(algo):
     assert settings_file(algo, "CartPole-v1").name == f"{algo}.yml"
+
+
+class AtariEnv(RandomEnv):
+    """By its name RL Zoo takes it for an Atari game."""
+
+
+@pytest.mark.parametrize("algo, arguments", [("ppo_cchain", SHORT_PPO), ("double_dqn", ())])
+def test_defaults_hold_for_atari_games(algo, arguments, tmp_path, monkeypatch):
+    monkeypatch.setitem(gym.registry, "Game-v0", EnvSpec("Game-v0", f"{__name__}:AtariEnv"))
+    train(tmp_path, algo, "Game-v0", 32, *arguments)
+    assert (tmp_path / algo / "Game-v0_1" / "Game-v0.zip").exists()
 
 
 def test_rl_zoos_own_settings_hold_where_we_have_none():

@@ -85,7 +85,14 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             if self.trial_id == 0:  # RL Zoo takes it for none
                 values = self.load_trial(self.storage, self.study_name, trial_id=0)
                 self.custom_hyperparams = {**values, **(self.custom_hyperparams or {})}
-        hyperparams, saved = super().read_hyperparameters()
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        except KeyError as error:
+            if error.args != ("atari",):
+                raise
+            # For Atari games RL Zoo asks for a section `atari`. A file without one has `default` for them, too
+            self._is_atari = False
+            hyperparams, saved = super().read_hyperparameters()
         self._hyperparameters_read = plain(saved)  # what follows changes parts of them in place
         return hyperparams, saved
 
