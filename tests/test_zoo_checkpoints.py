@@ -230,9 +230,11 @@ def test_checkpoints_change_nothing(tmp_path):
     assert_same_end(tmp_path, 1, 2)
 
 
-def test_help_lists_the_options(capsys):
-    with pytest.raises(SystemExit):
-        command("train", "--help")
+@pytest.mark.parametrize("arguments", [("--help",), ("--algo", "ppo_redo", "-h"), ("--resume", "nowhere", "-h")])
+def test_help_lists_the_options(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        command("train", *arguments)
+    assert ended.value.code == 0
     shown = capsys.readouterr().out
     for option in ("--checkpoint-freq STEPS", "--checkpoint-keep N", "--resume PATH", "--n-timesteps"):
         assert option in shown

@@ -144,10 +144,14 @@ def train(arguments: list[str]) -> None:
     RL Zoo's ``train``, with the settings of this package, and with checkpoints.
 
     :param arguments: Arguments of the command line
-    :raises SystemExit: When options do not go together, or training was interrupted
+    :raises SystemExit: When options do not go together, when training was interrupted, or after the help
     """
     if {"-h", "--help"} & set(arguments):
         print(make_parser().format_help())
+        # Without the other arguments, which may be wrong or lack settings
+        sys.argv[2:] = ["--help"]
+        run_script("train")
+        return
     checkpoints, rest = take_options(arguments)
     if checkpoints is not None:
         checkpoints, rest = find_resumed(checkpoints, rest)
