@@ -1,5 +1,6 @@
 """Checkpoints of ``sb3-cchain train``, and training that goes on exactly from them."""
 
+import json
 import os
 import shlex
 import shutil
@@ -222,6 +223,18 @@ def test_a_torn_checkpoint_is_passed_over(checkpoints, tmp_path):
         train(tmp_path, "--resume", tmp_path / "run", n=96, evaluation=NO_EVALUATION)
     assert (run_folder(tmp_path, 1) / "resumed_from").read_text().endswith("step_000000000032\n")
     assert saved_timesteps(run_folder(tmp_path, 1) / f"{NAME}.zip") == 96
+
+
+@pytest.mark.parametrize("options, kept", [((), 3), (("--checkpoint-keep", "1"), 1), (None, 2)])
+def test_as_many_checkpoints_stay_as_before(options, kept, tmp_path):
+    train(tmp_path, "--checkpoint-freq", 32, "--checkpoint-keep", 3, evaluation=NO_EVALUATION)
+    folder = run_folder(tmp_path, 1) / "checkpoints"
+    if options is None:  # as an earlier version wrote it
+        record = json.loads((folder / "command.json").read_text())
+        record.pop("checkpoint_keep", None)
+        (folder / "command.json").write_text(json.dumps(record))
+    train(tmp_path, "--resume", folder.parent, *(options or ()), n=320, evaluation=NO_EVALUATION)
+    assert len(list((run_folder(tmp_path, 2) / "checkpoints").glob("step_*"))) == kept
 
 
 def test_checkpoints_change_nothing(tmp_path):

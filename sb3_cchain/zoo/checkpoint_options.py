@@ -33,7 +33,7 @@ class CheckpointOptions(NamedTuple):
     What the options say.
 
     :param freq: Environment steps between two checkpoints, None for as many as in the training that goes on
-    :param keep: How many of the newest checkpoints stay
+    :param keep: How many of the newest checkpoints stay, None for as many as in the training that goes on
     :param typed: The other arguments, as typed
     :param resume: Where the checkpoint is that training goes on from, None for training from the start
     :param checkpoint: That checkpoint
@@ -41,7 +41,7 @@ class CheckpointOptions(NamedTuple):
     """
 
     freq: int | None
-    keep: int
+    keep: int | None
     typed: Sequence[str]
     resume: Path | None = None
     checkpoint: Checkpoint | None = None
@@ -75,7 +75,10 @@ def make_parser() -> argparse.ArgumentParser:
         "of the run",
     )
     group.add_argument(
-        "--checkpoint-keep", type=int, metavar="N", help=f"How many of the newest checkpoints stay (default: {KEEP})"
+        "--checkpoint-keep",
+        type=int,
+        metavar="N",
+        help=f"How many of the newest checkpoints stay (default: {KEEP}; with --resume, as before)",
     )
     group.add_argument(
         "--resume",
@@ -113,7 +116,8 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
             f"--resume and -i are both given, {given.resume} and {other.trained_agent}: --resume goes on exactly from a "
             "checkpoint, -i goes on from a model alone"
         )
-    return CheckpointOptions(given.checkpoint_freq, given.checkpoint_keep or KEEP, rest, given.resume), rest
+    keep = given.checkpoint_keep or (KEEP if given.resume is None else None)
+    return CheckpointOptions(given.checkpoint_freq, keep, rest, given.resume), rest
 
 
 def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[CheckpointOptions, list[str]]:
@@ -135,7 +139,9 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     seed.add_argument("--seed", type=int, default=-1)
     if seed.parse_known_args(arguments)[0].seed < 0:  # RL Zoo would draw one
         arguments = [*arguments, "--seed", str(record["options"]["seed"])]
-    return options._replace(freq=options.freq or record["checkpoint_freq"], checkpoint=checkpoint, record=record), arguments
+    freq = options.freq or record["checkpoint_freq"]
+    keep = options.keep or record.get("checkpoint_keep", KEEP)  # earlier versions did not write it
+    return options._replace(freq=freq, keep=keep, checkpoint=checkpoint, record=record), arguments
 
 
 def write_record(
@@ -151,6 +157,7 @@ def write_record(
     """
     record = {
         "checkpoint_freq": options.freq,
+        "checkpoint_keep": options.keep,
         "options": {name: plain(getattr(args, name)) for name in COMPARED},
         "hyperparameters": plain(hyperparameters),
     }

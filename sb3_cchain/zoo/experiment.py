@@ -205,7 +205,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             self.callbacks.append(self._make_checkpoint_callback(self.checkpoints))
 
     def _make_checkpoint_callback(self, options: CheckpointOptions) -> TrainingCheckpoint:
-        assert options.freq is not None
+        assert options.freq is not None and options.keep is not None
         callback = TrainingCheckpoint(options.freq, self.checkpoint_folder, options.keep)
         callback.advice = ""  # the summary says how to go on
         if self.resumed is not None:
