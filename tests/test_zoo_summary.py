@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from sb3_cchain.tasks.clock import TaskClock
-from sb3_cchain.zoo.summary import TaskSummary, summarise_tasks, task_ends, task_table
+from sb3_cchain.zoo.summary import TaskSummary, summarise_tasks, task_steps, task_table
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
 COLUMNS = ("timesteps", "task_id", "n_episodes", "mean_return")
@@ -24,20 +24,27 @@ TASKS = [
 
 
 def test_tasks_by_hand():
-    assert summarise_tasks(ROWS, {0: 2500, 1: 3500, 2: 4000}) == TASKS
+    assert summarise_tasks(ROWS, {0: 2500, 1: 1000, 2: 500}) == TASKS
 
 
 @pytest.mark.parametrize(
-    "clock, num_timesteps, ends",
+    "clock, num_timesteps, steps",
     [
-        (TaskClock([2500, 1000, 900]), 4000, {0: 2500, 1: 3500, 2: 4000}),
+        (TaskClock([2500, 1000, 900]), 4000, {0: 2500, 1: 1000, 2: 500}),
         (TaskClock([2500, 1000, 900]), 2500, {0: 2500}),  # the second has not begun
-        (TaskClock([100, 2500, 1000], first_task=1), 2600, {1: 2500, 2: 2600}),
-        (None, 4000, {0: 2400, 1: 3200, 2: 4000}),
+        (TaskClock([100, 2500, 1000], first_task=1), 2600, {1: 2500, 2: 100}),
+        (None, 4000, {0: 2400, 1: 800, 2: 800}),
     ],
 )
-def test_where_tasks_end_by_hand(clock, num_timesteps, ends):
-    assert task_ends(ROWS, clock, num_timesteps) == ends
+def test_steps_of_tasks_by_hand(clock, num_timesteps, steps):
+    assert task_steps(ROWS, clock, num_timesteps) == steps
+
+
+def test_steps_of_tasks_that_come_back_by_hand():
+    rows = [dict(timesteps=100 * i, task_id=task) for i, task in enumerate([0, 1, 0, 1, 0], start=1)]
+    assert task_steps(rows, None, 500) == {0: 300, 1: 200}
+    assert task_steps(rows[:-1], None, 450) == {0: 200, 1: 250}
+    assert task_steps([], None, 500) == {}
 
 
 def test_the_table_fits_a_terminal():

@@ -45,17 +45,16 @@ class TaskSummary(NamedTuple):
     last_return: float
 
 
-def summarise_tasks(rows: Sequence[Mapping[str, float]], ends: Mapping[int, int]) -> list[TaskSummary]:
+def summarise_tasks(rows: Sequence[Mapping[str, float]], steps: Mapping[int, int]) -> list[TaskSummary]:
     """
     :param rows: Rows of ``returns.csv``
-    :param ends: Environment step at which each task ended, in their order
+    :param steps: Environment steps in each task
     :return: The tasks that have rows
     """
     averages = task_averages(rows)
-    starts = dict(zip(ends, [0, *ends.values()], strict=False))
     return [
-        TaskSummary(task_id, end - starts[task_id], _n_episodes(rows, task_id), averages[task_id], _last_return(rows, task_id))
-        for task_id, end in ends.items()
+        TaskSummary(task_id, n_steps, _n_episodes(rows, task_id), averages[task_id], _last_return(rows, task_id))
+        for task_id, n_steps in steps.items()
         if task_id in averages
     ]
 
@@ -74,20 +73,25 @@ def _last_return(rows: Sequence[Mapping[str, float]], task_id: int) -> float:
     return float(np.average([row["mean_return"] for row in last], weights=[max(row["n_episodes"], 1) for row in last]))
 
 
-def task_ends(rows: Sequence[Mapping[str, float]], clock: TaskClock | None, num_timesteps: int) -> dict[int, int]:
+def task_steps(rows: Sequence[Mapping[str, float]], clock: TaskClock | None, num_timesteps: int) -> dict[int, int]:
     """
     :param rows: Rows of ``returns.csv``
     :param clock: That of the continual environment, None where there is none
     :param num_timesteps: Environment steps of the training
-    :return: Environment step at which each task ended: as the clock says, otherwise the last that has a row
+    :return: Environment steps in each task: as the clock says, otherwise those from one row to the next
     """
     if clock is None:
-        ends = {int(row["task_id"]): int(row["timesteps"]) for row in rows}
-        present = max(ends, default=0)
+        ends = [(int(row["task_id"]), int(row["timesteps"])) for row in rows]
+        ends += [(task_id, num_timesteps) for task_id, _ in ends[-1:]]  # after the last row the task is the same
     else:
-        ends = dict(enumerate([step for step in clock.switches if step < num_timesteps], start=clock.first_task))
-        present = clock.first_task + len(ends)
-    return {**ends, present: num_timesteps}
+        switches = [step for step in clock.switches if step < num_timesteps]
+        ends = list(enumerate([*switches, num_timesteps], start=clock.first_task))
+    steps: dict[int, int] = {}
+    begin = 0
+    for task_id, end in ends:
+        steps[task_id] = steps.get(task_id, 0) + end - begin
+        begin = end
+    return steps
 
 
 def task_table(tasks: Sequence[TaskSummary], names: Sequence[str]) -> Table:
@@ -134,7 +138,7 @@ class TrainingSummary:
         if active_signal(self._env) is not None:  # which numbers the tasks in its own way
             self._clock, self._names = None, []
         rows = getattr(self._model, "continual_returns", [])
-        tasks = summarise_tasks(rows, task_ends(rows, self._clock, self._model.num_timesteps))
+        tasks = summarise_tasks(rows, task_steps(rows, self._clock, self._model.num_timesteps))
         _print_line(console, self._steps())
         if tasks:
             console.print(task_table(tasks, self._names))
@@ -169,7 +173,7 @@ class TrainingSummary:
         if "Model" in places and number.isdecimal():  # RL Zoo does not find a folder that ends in a uuid
             command = ["sb3-cchain", "enjoy", "--algo", args.algo, "--env", args.env, "-f", args.log_folder]
             command += ["--exp-id", number]
-            last = 0 if self._clock is None else max(task_ends([], self._clock, self._model.num_timesteps))
+            last = 0 if self._clock is None else max(task_steps([], self._clock, self._model.num_timesteps))
             if last > 0 and args.env.startswith("Continual/"):  # other environments may not have the argument
                 command += ["--env-kwargs", f"first_task:{last}"]
             commands["Watch it"] = shlex.join(command)
