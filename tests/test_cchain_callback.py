@@ -9,8 +9,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cchain import CChainCallback, CChainPPO
+from sb3_cchain import CChainCallback, CChainPPO, TaskSignal
 from sb3_cchain.churn import ChurnReducer
+from sb3_cchain.methods import EntropyBonusRestart
 from tests.churn_models import PPO_SETTINGS as SETTINGS
 from tests.churn_models import assert_churn_was_reduced, assert_equal, differ
 from tests.envs import RandomEnv
@@ -157,6 +158,21 @@ def test_the_same_callback_acts_once_after_an_interruption():
         patch.setattr(ChurnReducer, "end_iteration", count)
         model.learn(32, callback=[callback, interrupt])
     assert n_losses == [1, 2]  # of two updates each, the first without a churn loss
+
+
+def test_what_an_error_left_before_train_does_not_meet_other_callbacks():
+    class Error(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            raise KeyboardInterrupt
+
+    model = make_model()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(48, [CChainCallback(), Error()])
+    model.learn(48, [CChainCallback(), TaskSignal(switch_at=[16]), EntropyBonusRestart()])
+    assert not {"train", "_excluded_save_params"} & set(vars(model))
 
 
 def test_a_train_method_of_the_user_stays():

@@ -1,5 +1,7 @@
 """Exploration that begins again at each task."""
 
+import json
+
 import numpy as np
 import pytest
 import torch as th
@@ -7,12 +9,29 @@ from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
-from sb3_cchain import CChainPPO, TaskSignal
+from sb3_cchain import CChainCallback, CChainPPO, TaskSignal, TrainingCheckpoint
 from sb3_cchain.methods import EntropyBonusRestart, ExplorationRateRestart, LogStdRestart
 from tests.envs import CountEnv, RandomEnv
 from tests.method_models import make_model
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
+
+
+class InTrain(BaseCallback):
+    """Reads ``ent_coef`` in ``train()``, by the step at which the rollout began."""
+
+    def __init__(self):
+        super().__init__()
+        self.ent_coefs = {}
+
+    def _on_training_start(self):
+        self.model.policy.optimizer.register_step_pre_hook(self._read)
+
+    def _on_step(self):
+        return True
+
+    def _read(self, *_):
+        self.ent_coefs[self.num_timesteps - self.model.n_steps] = self.model.ent_coef
 
 
 class Spy(BaseCallback):
@@ -28,20 +47,6 @@ class Spy(BaseCallback):
     def _on_step(self):
         self.before_steps[self.num_timesteps - 1] = self.read(self.model)
         return True
-
-
-class SpyBeforeTrain(BaseCallback):
-    """Reads ``ent_coef`` when a rollout has ended, right before ``train()``; by the step at which the rollout began."""
-
-    def __init__(self):
-        super().__init__()
-        self.ent_coefs = {}
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_end(self):
-        self.ent_coefs[self.num_timesteps - self.model.n_steps] = self.model.ent_coef
 
 
 def test_the_exploration_rate():
@@ -94,7 +99,7 @@ def test_the_references_are_forgotten():
 
 
 def test_the_entropy_bonus():
-    model, spy = make_model("PPO", CountEnv(), ent_coef=0.1), SpyBeforeTrain()
+    model, spy = make_model("PPO", CountEnv(), ent_coef=0.1), InTrain()
     for steps in (48, 64):
         callbacks = [TaskSignal(switch_at=[32]), EntropyBonusRestart(0.5, n_steps=64), spy]
         model.learn(steps, callbacks, reset_num_timesteps=False)
@@ -107,17 +112,20 @@ def test_the_raised_entropy_bonus_is_not_left_in_the_model(tmp_path):
     class Interruption(CheckpointCallback):
         def _on_rollout_end(self):
             if self.num_timesteps == 48:
-                assert model.ent_coef == pytest.approx(0.5)
                 model.policy.optimizer.register_step_pre_hook(self.interrupt)
 
         def interrupt(self, *_):
+            assert model.ent_coef == pytest.approx(0.5)
             raise KeyboardInterrupt
 
     model = make_model("PPO", CountEnv(), ent_coef=0.1)
-    callbacks = [TaskSignal(switch_at=[16]), EntropyBonusRestart(0.5, n_steps=10**9), Interruption(40, tmp_path)]
+    checkpoint = TrainingCheckpoint(16, tmp_path / "training")
+    callbacks = [checkpoint, TaskSignal(switch_at=[16]), EntropyBonusRestart(0.5, n_steps=10**9), Interruption(40, tmp_path)]
     with pytest.raises(KeyboardInterrupt):
         model.learn(64, callbacks)
-    assert model.ent_coef == 0.1 and PPO.load(tmp_path / "rl_model_40_steps").ent_coef == 0.1
+    saved = [PPO.load(path) for path in tmp_path.rglob("*.zip")]
+    assert [each.ent_coef for each in (model, *saved)] == [0.1] * 4
+    assert all(not json.loads(path.read_text())["left_out"] for path in tmp_path.rglob("checkpoint.json"))
 
 
 def test_the_users_own_entropy_bonus_may_change_between_calls_of_learn():
@@ -126,6 +134,19 @@ def test_the_users_own_entropy_bonus_may_change_between_calls_of_learn():
         model.ent_coef = ent_coef
         model.learn(32, [TaskSignal(switch_every=16), EntropyBonusRestart(0.5)], reset_num_timesteps=False)
         assert model.ent_coef == ent_coef
+
+
+def test_the_loss_of_c_chain_has_the_raised_bonus():
+    """In both forms, and wherever the callback stands: λ follows from it."""
+    coefs = []
+    for form, callbacks in (("CChainPPO", []), ("PPO", [0]), ("PPO", [1])):
+        given = [TaskSignal(switch_at=[16]), EntropyBonusRestart(5.0, n_steps=10**9)]
+        for position in callbacks:
+            given.insert(2 * position, CChainCallback(churn_warmup=1))
+        settings = dict(churn_warmup=1) if form == "CChainPPO" else {}
+        model = make_model(form, CountEnv(), ent_coef=0.1, **settings).learn(64, given)
+        coefs.append(model.logger.name_to_value["churn/coef"])
+    assert coefs[0] == coefs[1] == coefs[2] > 0
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """C-CHAIN for a stock model, for instance one that the stock ``rl_zoo3`` command trains."""
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
@@ -13,10 +14,9 @@ from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
-from sb3_cchain.callbacks.replaced_methods import not_saved
+from sb3_cchain.callbacks.replaced_methods import wrapped
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.lean_distributions import make_lean
-from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
@@ -151,22 +151,18 @@ class CChainCallback(FiniteCheck):
         self._replaced.close()
         if not self.churn_reducers.active():
             return
-        model: Any = self.model
-        train = model.train
+        # Innermost, so that L is computed with what other callbacks set for train()
+        self._replaced.enter_context(wrapped(self.model, "train", self._train_once, innermost=True))
 
-        def train_once(*args: Any, **kwargs: Any) -> None:
-            self._replaced.close()  # first, so that this method is gone when train() fails, too
-            if self.model.start_time != self._start_time:
-                # Left from a learn() that was interrupted between the end of a rollout and train()
-                train(*args, **kwargs)
-                return
-            with reduced_churn(self.model, self.churn_reducers, self._options):
-                train(*args, **kwargs)
-            self._state.n_updates = self.model._n_updates
-
-        self._replaced.enter_context(replaced(self.model, "train", train_once))
-        # A model that is saved at this point must not contain it: after loading, it would train the model that was saved
-        self._replaced.enter_context(not_saved(self.model, "train"))
+    def _train_once(self, train: Callable[[], None]) -> None:
+        self._replaced.close()  # first, so that nothing is left when train() fails, too
+        if self.model.start_time != self._start_time:
+            # Left from a learn() that was interrupted between the end of a rollout and train()
+            train()
+            return
+        with reduced_churn(self.model, self.churn_reducers, self._options):
+            train()
+        self._state.n_updates = self.model._n_updates
 
     def _on_training_end(self) -> None:
         self._replaced.close()

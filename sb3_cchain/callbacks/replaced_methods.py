@@ -11,50 +11,23 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 Wrapper = Callable[[Callable[[], Any]], Any]
 
 
-class _WrappedMethod:
-    """Calls a method through wrappers, the first one innermost."""
-
-    def __init__(self, method: Callable[..., Any]):
-        self.method = method
-        self.wrappers: list[Wrapper] = []
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        call = partial(self.method, *args, **kwargs)
-        for wrapper in self.wrappers:
-            call = partial(wrapper, call)
-        return call()
-
-
-class _ExcludedSaveParams:
-    """Adds names to those that a model's ``_excluded_save_params()`` returns."""
-
-    def __init__(self, method: Callable[[], list[str]]):
-        self.method = method
-        self.names: list[str] = []
-
-    def __call__(self) -> list[str]:
-        return [*self.method(), *self.names, "_excluded_save_params"]
-
-
 @contextmanager
-def wrapped(owner: object, method: str, wrapper: Wrapper) -> Iterator[None]:
+def wrapped(owner: object, method: str, wrapper: Wrapper, innermost: bool = False) -> Iterator[None]:
     """
     :param owner: A model, or an object that it uses, such as its environment
     :param method: Name of one of its methods
     :param wrapper: Called in place of the method inside the ``with`` block
+    :param innermost: Whether it calls the method itself, and not the wrappers that are there already
     """
-    replacement = vars(owner).get(method)
-    if not isinstance(replacement, _WrappedMethod):
-        replacement = _WrappedMethod(getattr(owner, method))
-        setattr(owner, method, replacement)
-    replacement.wrappers.append(wrapper)
+    wrappers: list[Wrapper] = _parts_of(owner, method, "wrappers", _with_wrappers)
+    wrappers.insert(0 if innermost else len(wrappers), wrapper)
     try:
         with not_saved(owner, method) if isinstance(owner, BaseAlgorithm) else nullcontext():
             yield
     finally:
-        replacement.wrappers.remove(wrapper)
-        if not replacement.wrappers:
-            delattr(owner, method)
+        wrappers.remove(wrapper)
+        if not wrappers:
+            _put_back(owner, method)
 
 
 @contextmanager
@@ -63,14 +36,54 @@ def not_saved(model: BaseAlgorithm, name: str) -> Iterator[None]:
     :param model: A model, all attributes of which Stable-Baselines3 saves
     :param name: An attribute that is not saved inside the ``with`` block
     """
-    replacement = vars(model).get("_excluded_save_params")
-    if not isinstance(replacement, _ExcludedSaveParams):
-        replacement = _ExcludedSaveParams(model._excluded_save_params)
-        model._excluded_save_params = replacement  # type: ignore[method-assign]
-    replacement.names.append(name)
+    names: list[str] = _parts_of(model, "_excluded_save_params", "names", _with_names)
+    names.append(name)
     try:
         yield
     finally:
-        replacement.names.remove(name)
-        if not replacement.names:
-            del model._excluded_save_params
+        names.remove(name)
+        if not names:
+            _put_back(model, "_excluded_save_params")
+
+
+def _parts_of(owner: object, method: str, parts: str, make: Callable[[Any], Any]) -> Any:
+    """What several blocks add to, an attribute of the function that stands in the place of a method."""
+    replacement: Any = vars(owner).get(method)
+    if not hasattr(replacement, parts):
+        before, replacement = replacement, make(getattr(owner, method))
+        replacement.before = before
+        setattr(owner, method, replacement)
+    return getattr(replacement, parts)
+
+
+def _put_back(owner: object, method: str) -> None:
+    before = vars(owner)[method].before
+    delattr(owner, method)
+    if before is not None:  # a method that the user gave to this object
+        setattr(owner, method, before)
+
+
+# These are functions, not objects of a class, because TrainingCheckpoint saves the state of objects
+
+
+def _with_wrappers(method: Callable[..., Any]) -> Any:
+    wrappers: list[Wrapper] = []
+
+    def replacement(*args: Any, **kwargs: Any) -> Any:
+        call = partial(method, *args, **kwargs)
+        for wrapper in wrappers:
+            call = partial(wrapper, call)
+        return call()
+
+    replacement.wrappers = wrappers  # type: ignore[attr-defined]
+    return replacement
+
+
+def _with_names(excluded_save_params: Callable[[], list[str]]) -> Any:
+    names: list[str] = []
+
+    def replacement() -> list[str]:
+        return [*excluded_save_params(), *names, "_excluded_save_params"]
+
+    replacement.names = names  # type: ignore[attr-defined]
+    return replacement

@@ -7,7 +7,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_cchain.callbacks.replaced_methods import wrapped
+from sb3_cchain.callbacks.replaced_methods import Wrapper, wrapped
 
 
 class TrainingHooks:
@@ -71,30 +71,25 @@ class TrainingHooks:
 
         def call_both(call: Callable[[], Any]) -> Any:
             result = call()
-            if self._is_over():
-                self.remove()
-            else:
-                function(result)
+            function(result)
             return result
 
-        self._attached.enter_context(wrapped(owner, method, call_both))
+        self.around_call(owner, method, call_both)
 
-    def on_error(self, owner: object, method: str, function: Callable[[], None]) -> None:
+    def around_call(self, owner: object, method: str, function: Wrapper) -> None:
         """
         :param owner: The model, or an object that it uses
         :param method: Name of one of its methods
-        :param function: Called when the method ends by an exception, Ctrl-C included
+        :param function: Called in its place, with a function that calls the method; returns what the method is to return
         """
 
-        def watch(call: Callable[[], Any]) -> Any:
-            try:
+        def call_around(call: Callable[[], Any]) -> Any:
+            if self._is_over():
+                self.remove()
                 return call()
-            except BaseException:
-                if not self._is_over():
-                    function()
-                raise
+            return function(call)
 
-        self._attached.enter_context(wrapped(owner, method, watch))
+        self._attached.enter_context(wrapped(owner, method, call_around))
 
     def _is_over(self) -> bool:
         # SB3 sets the start time at the beginning of each `learn()`

@@ -1,5 +1,6 @@
 """Exploration that begins again at each task: by the exploration rate, the standard deviation or the entropy bonus."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -9,6 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.validation import check_number
 
@@ -123,7 +125,6 @@ class EntropyBonusRestart(TaskBoundary):
         check_number("n_steps", n_steps, 1, integer=True)
         self.ent_coef = ent_coef
         self.n_steps = n_steps
-        self._own_ent_coef: float | None = None  # while it is raised
         self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
@@ -134,9 +135,8 @@ class EntropyBonusRestart(TaskBoundary):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         model: Any = self.model
-        self._own_ent_coef = None
         self._hooks.begin(model)
-        self._hooks.on_error(model, "train", self._put_back)
+        self._hooks.around_call(model, "train", self._train)
         if self.num_timesteps == 0 or not hasattr(model, "ent_coef_restart"):
             model.ent_coef_restart = None
 
@@ -144,23 +144,19 @@ class EntropyBonusRestart(TaskBoundary):
         self.model.ent_coef_restart = self.num_timesteps  # type: ignore[attr-defined]
 
     def _on_rollout_start(self) -> None:
-        self._put_back()
         super()._on_rollout_start()
         self._rollout_start = self.num_timesteps
 
-    def _on_rollout_end(self) -> None:
+    def _train(self, train: Callable[[], None]) -> None:
         model: Any = self.model
-        if model.ent_coef_restart is not None:
-            share = (self._rollout_start - model.ent_coef_restart) / self.n_steps
-            self._own_ent_coef = model.ent_coef
-            model.ent_coef = _between(self.ent_coef, model.ent_coef, share)
-
-    def _put_back(self) -> None:
-        if self._own_ent_coef is not None:
-            self.model.ent_coef, self._own_ent_coef = self._own_ent_coef, None
+        if model.ent_coef_restart is None:
+            train()
+            return
+        share = (self._rollout_start - model.ent_coef_restart) / self.n_steps
+        with replaced(model, "ent_coef", _between(self.ent_coef, model.ent_coef, share)):
+            train()
 
     def _on_training_end(self) -> None:
-        self._put_back()
         self._hooks.remove()
 
 
