@@ -35,7 +35,7 @@ class LayerReset(SwitchOrInterval):
       features extractor count, in the order of its modules.
     - DQN's target network gets the same draw. The paper's text does not fix this for all of its agents; it is assumed here,
       so that targets do not pull the fresh layer back to the old one.
-    - Frozen layers count and are left alone.
+    - Frozen layers count, and what is frozen is left alone.
     - The standard deviation of Gaussian actions (``log_std``) is in no layer and stays:
       :class:`~sb3_cchain.methods.LogStdRestart` restarts it.
 
@@ -83,7 +83,7 @@ def network_layers(policy: nn.Module) -> list[list[list[str]]]:
     """
     :param policy: A policy of an on-policy algorithm or of DQN
     :return: For each of its trained networks, for each layer in the order of the data, the names of its parameters and
-        buffers, none of a frozen layer
+        buffers, none that is frozen
     :raises AttributeError: For networks that are not made of SB3's parts
     """
     networks = [("q_net",)] if hasattr(policy, "q_net") else [_ACTOR, _CRITIC]
@@ -95,9 +95,9 @@ def network_layers(policy: nn.Module) -> list[list[list[str]]]:
                 if isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)):
                     layers.append([])
                 parameters = dict(module.named_parameters(recurse=False))
-                if parameters and not any(parameter.requires_grad for parameter in parameters.values()):
-                    continue  # frozen
-                own = [*parameters, *dict(module.named_buffers(recurse=False))]
+                own = [key for key, parameter in parameters.items() if parameter.requires_grad]
+                if own or not parameters:  # not frozen
+                    own += dict(module.named_buffers(recurse=False))
                 if own and not layers:
                     layers.append([])  # a norm or an embedding before the first layer
                 for key in own:

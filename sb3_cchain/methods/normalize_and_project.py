@@ -84,7 +84,8 @@ class NormalizeAndProject(OptimizerWrapper):
         norms = _norms(weights)
         initial = self.own_state["initial_norms"].to(norms.device)
         for weight, factor in zip(weights, th.where(norms > 0, initial / norms, 1.0), strict=True):
-            weight.mul_(factor)
+            if weight.requires_grad:
+                weight.mul_(factor)
         self.own_state["norm"] = th.where(initial > 0, norms / initial, 1.0).mean()
 
     def metrics(self) -> dict[str, float]:
