@@ -5,6 +5,7 @@ import torch as th
 from gymnasium.wrappers import TimeLimit
 from sb3_contrib import ARS
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import CallbackList
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.callbacks import NoBootstrapAtCuts
@@ -43,9 +44,10 @@ def test_at_a_switch_too():
     assert rewards == [1.0] * 16
 
 
-def test_metrics_see_the_cut():
+@pytest.mark.parametrize("kind", [list, CallbackList])
+def test_metrics_see_the_cut(kind):
     model = CChainPPO("MlpPolicy", ContinualEnv([Ones, Ones], 32), n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
-    model.learn(64, [TaskSignal(), NoBootstrapAtCuts()])
+    model.learn(64, kind([TaskSignal(), NoBootstrapAtCuts()]))
     assert [(row["task_id"], row["n_episodes"], row["mean_return"]) for row in model.continual_returns] == [
         (0, 0, 1),
         (1, 0, 1),

@@ -1,5 +1,7 @@
 """What an algorithm adds by itself when its environment is continual, or a TaskSignal says when it changes."""
 
+from collections.abc import Iterator
+
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -17,6 +19,7 @@ def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> l
     :return: The same, in a continual environment preceded by TaskSync and ContinualMetrics. With a TaskSignal among them,
         ContinualMetrics is right behind it, in any environment. What is already there is not added.
     """
+    given = list(_unpacked(given))
 
     def has(kind: type[BaseCallback], callbacks: list[BaseCallback]) -> bool:
         return any(isinstance(callback, kind) for callback in iterate_callbacks(CallbackList(callbacks)))
@@ -27,3 +30,11 @@ def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> l
     # Callbacks behind it may change what a step has told, as NoBootstrapAtCuts does
     n_before = next((n for n in range(len(given) + 1) if has(TaskSignal, given[:n])), 0)
     return [*sync, *given[:n_before], *metrics, *given[n_before:]]
+
+
+def _unpacked(callbacks: list[BaseCallback]) -> Iterator[BaseCallback]:
+    for callback in callbacks:
+        if isinstance(callback, CallbackList):
+            yield from _unpacked(callback.callbacks)
+        else:
+            yield callback
