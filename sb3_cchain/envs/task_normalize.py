@@ -84,6 +84,10 @@ class TaskVecNormalize(VecNormalize):
         self._signal_switch = TaskSwitch()
         self._before_reset: dict[str, Any] | None = None
 
+    def forget_task(self) -> None:
+        """Go on with the same statistics in any task that comes next."""
+        self._switch, self._signal_switch = TaskSwitch(), TaskSwitch()
+
     def reset(self) -> Observation:
         """
         Reset all environments.

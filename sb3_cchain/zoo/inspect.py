@@ -28,6 +28,7 @@ from sb3_cchain.analysis.inspection import Inspection, findings_text, inspect_mo
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.checkpoint import check_model_file, check_writable
+from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.zoo.settings import read_saved
 
 
@@ -51,7 +52,7 @@ def make_as_trained(
     env_kwargs = {**(settings or {}), **(options or {}), **env_kwargs}
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
     norm_reward = hyperparams.get("normalize_kwargs", {}).get("norm_reward", True)
-    # RL Zoo's own callback that writes files; inspect_model() leaves out all others
+    # RL Zoo's own callback that writes files; inspect_model() leaves out those of SB3 and of this package
     callbacks = [each for each in get_callback_list(hyperparams) if not isinstance(each, SaveVecNormalizeCallback)]
     env = create_test_env(
         env_id,
@@ -301,6 +302,9 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
 def _forget_task(model: Any, callbacks: Sequence[Any]) -> None:
     """The user's choice of a task is no switch, at which methods would act and λ would start over."""
     model.trained_task_id = None
+    normalize = model.get_vec_normalize_env()
+    if isinstance(normalize, TaskVecNormalize):
+        normalize.forget_task()
     for each in (model, *callbacks):
         if hasattr(each, "reset_churn_coef"):
             each.reset_churn_coef = False
