@@ -330,14 +330,12 @@ class TrainingCheckpoint(BaseCallback):
 
 def _check_class(algorithm: type[BaseAlgorithm]) -> None:
     try:
-        is_found = find_named(name_in_module(algorithm)) is algorithm
-    except (AttributeError, ImportError):
-        is_found = False
-    if not is_found:
+        find_named(name_in_module(algorithm))
+    except (AttributeError, ImportError) as error:
         raise ValueError(
             f"Training of {algorithm.__qualname__} could not be resumed, because there is no such class in its module "
             f"{algorithm.__module__}: define it at the top level of the module"
-        )
+        ) from error
 
 
 def _is_learning(model: BaseAlgorithm, frame: FrameType | None) -> bool:
