@@ -316,6 +316,20 @@ class RecordStatistics(BaseCallback):
         return True
 
 
+def test_a_task_that_is_chosen_is_no_switch_after_forget_task():
+    env = TaskVecNormalize(make_sequence())
+    env.reset()
+    for _ in range(10):
+        env.step(np.zeros(1, dtype=int))
+    for task_id, forgets, count in ((2, True, 12), (1, False, 1)):
+        env.env_method("set_task", task_id)
+        if forgets:
+            env.forget_task()
+        env.reset()
+        assert env.obs_rms.count == pytest.approx(count, abs=0.01)
+        env.step(np.zeros(1, dtype=int))
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_evaluation_has_the_statistics_of_training(n_envs):
     recorded = RecordStatistics()
