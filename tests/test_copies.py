@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, TaskSignal
+from sb3_cchain.methods import ExplorationRateRestart
 from tests.churn_models import assert_equal
 from tests.envs import RandomEnv
 
@@ -50,6 +52,19 @@ def test_a_copy_goes_on_and_saves_what_it_learned(make, duplicate, tmp_path):
     assert int(saved.coefficient.n_seen) == int(kept.coefficient.n_seen) > n_seen
     assert saved.coefficient.value == kept.coefficient.value
     assert np.array_equal(saved.reference, kept.reference)
+
+
+def test_a_copy_that_is_made_in_training_trains_itself():
+    class Copy(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 20:
+                copies.append(copy.deepcopy(self.model))
+            return True
+
+    model, copies = make_dqn(), []
+    model.learn(32, [TaskSignal(switch_at=[8]), ExplorationRateRestart(), Copy()])
+    copies[0].learn(48)
+    assert model.num_timesteps == model._n_calls == 32 and copies[0]._n_calls == 19 + 48
 
 
 @pytest.mark.parametrize("make", [make_ppo, make_dqn, make_dqn_ahead])

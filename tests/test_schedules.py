@@ -125,6 +125,22 @@ def test_beside_another_callback_that_watches_the_model(tmp_path):
     assert not replaced & vars(model).keys() and not replaced & vars(DQN.load(tmp_path / "model", device="cpu")).keys()
 
 
+class WrapAsUsersDo(BaseCallback):
+    def _on_training_start(self):
+        step = self.model._on_step
+        self.model._on_step = lambda: step()
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("is_last", [False, True])
+def test_beside_a_callback_that_replaces_the_method_by_hand(is_last):
+    model, callbacks = make(DQN), [TaskSignal(switch_at=[16]), ExplorationRateRestart(), WrapAsUsersDo()]
+    model.learn(48, callbacks if is_last else [callbacks[2], *callbacks[:2]])
+    assert model.num_timesteps == 48 and model._n_calls == 48
+
+
 def test_two_that_watch_the_same_method():
     model, seen = make(PPO), []
     first, second = TrainingHooks(), TrainingHooks()

@@ -3,12 +3,47 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 # Is given a function that calls the method, and returns what the method is to return
 Wrapper = Callable[[Callable[[], Any]], Any]
+
+
+class _StandIn:
+    """Its method ``call`` stands in the place of a method. Bound methods are what deepcopy() and TrainingCheckpoint expect."""
+
+    def __init__(self, owner: object, method: str):
+        self.method: Callable[..., Any] = getattr(owner, method)
+        self.own_method = vars(owner).get(method)  # that the user gave to this object
+
+    def call(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
+
+
+class _Wrapped(_StandIn):
+    def __init__(self, owner: object, method: str):
+        super().__init__(owner, method)
+        self.wrappers: list[Wrapper] = []
+
+    def call(self, *args: Any, **kwargs: Any) -> Any:
+        call = partial(self.method, *args, **kwargs)
+        for wrapper in self.wrappers:
+            call = partial(wrapper, call)
+        return call()
+
+
+class _ExcludedSaveParams(_StandIn):
+    def __init__(self, owner: object, method: str):
+        super().__init__(owner, method)
+        self.names: list[str] = []
+
+    def call(self, *args: Any, **kwargs: Any) -> list[str]:
+        return [*self.method(), *self.names, "_excluded_save_params"]
+
+
+AnyStandIn = TypeVar("AnyStandIn", bound=_StandIn)
 
 
 @contextmanager
@@ -19,15 +54,15 @@ def wrapped(owner: object, method: str, wrapper: Wrapper, innermost: bool = Fals
     :param wrapper: Called in place of the method inside the ``with`` block
     :param innermost: Whether it calls the method itself, and not the wrappers that are there already
     """
-    wrappers: list[Wrapper] = _parts_of(owner, method, "wrappers", _with_wrappers)
-    wrappers.insert(0 if innermost else len(wrappers), wrapper)
+    stand_in = _stand_in(owner, method, _Wrapped)
+    stand_in.wrappers.insert(0 if innermost else len(stand_in.wrappers), wrapper)
     try:
         with not_saved(owner, method) if isinstance(owner, BaseAlgorithm) else nullcontext():
             yield
     finally:
-        wrappers.remove(wrapper)
-        if not wrappers:
-            _put_back(owner, method)
+        stand_in.wrappers.remove(wrapper)
+        if not stand_in.wrappers:
+            _put_back(owner, method, stand_in)
 
 
 @contextmanager
@@ -36,54 +71,32 @@ def not_saved(model: BaseAlgorithm, name: str) -> Iterator[None]:
     :param model: A model, all attributes of which Stable-Baselines3 saves
     :param name: An attribute that is not saved inside the ``with`` block
     """
-    names: list[str] = _parts_of(model, "_excluded_save_params", "names", _with_names)
-    names.append(name)
+    stand_in = _stand_in(model, "_excluded_save_params", _ExcludedSaveParams)
+    stand_in.names.append(name)
     try:
         yield
     finally:
-        names.remove(name)
-        if not names:
-            _put_back(model, "_excluded_save_params")
+        stand_in.names.remove(name)
+        if not stand_in.names:
+            _put_back(model, "_excluded_save_params", stand_in)
 
 
-def _parts_of(owner: object, method: str, parts: str, make: Callable[[Any], Any]) -> Any:
-    """What several blocks add to, an attribute of the function that stands in the place of a method."""
-    replacement: Any = vars(owner).get(method)
-    if not hasattr(replacement, parts):
-        before, replacement = replacement, make(getattr(owner, method))
-        replacement.before = before
-        setattr(owner, method, replacement)
-    return getattr(replacement, parts)
+def _stand_in(owner: object, method: str, kind: type[AnyStandIn]) -> AnyStandIn:
+    present = _present(owner, method)
+    if isinstance(present, kind):
+        return present
+    made = kind(owner, method)
+    setattr(owner, method, made.call)
+    return made
 
 
-def _put_back(owner: object, method: str) -> None:
-    before = vars(owner)[method].before
+def _put_back(owner: object, method: str, stand_in: _StandIn) -> None:
+    if _present(owner, method) is not stand_in:
+        return  # the user has put something else in its place, which may call it
     delattr(owner, method)
-    if before is not None:  # a method that the user gave to this object
-        setattr(owner, method, before)
+    if stand_in.own_method is not None:
+        setattr(owner, method, stand_in.own_method)
 
 
-# These are functions, not objects of a class, because TrainingCheckpoint saves the state of objects
-
-
-def _with_wrappers(method: Callable[..., Any]) -> Any:
-    wrappers: list[Wrapper] = []
-
-    def replacement(*args: Any, **kwargs: Any) -> Any:
-        call = partial(method, *args, **kwargs)
-        for wrapper in wrappers:
-            call = partial(wrapper, call)
-        return call()
-
-    replacement.wrappers = wrappers  # type: ignore[attr-defined]
-    return replacement
-
-
-def _with_names(excluded_save_params: Callable[[], list[str]]) -> Any:
-    names: list[str] = []
-
-    def replacement() -> list[str]:
-        return [*excluded_save_params(), *names, "_excluded_save_params"]
-
-    replacement.names = names  # type: ignore[attr-defined]
-    return replacement
+def _present(owner: object, method: str) -> Any:
+    return getattr(vars(owner).get(method), "__self__", None)
