@@ -54,6 +54,18 @@ def test_metrics_see_the_cut(kind):
     ]
 
 
+def test_a_list_of_the_users_own_is_called():
+    class OwnList(CallbackList):
+        def _on_step(self):
+            steps.append(self.num_timesteps)
+            return super()._on_step()
+
+    steps = []
+    model = CChainPPO("MlpPolicy", ContinualEnv([Ones, Ones], 32), n_steps=16, batch_size=8, n_epochs=1, device="cpu")
+    model.learn(32, OwnList([TaskSignal()]))
+    assert steps == list(range(1, 33)) and len(model.continual_returns) == 1
+
+
 def test_off_policy():
     model = DQN("MlpPolicy", TimeLimit(Ones(), 5), learning_starts=100, buffer_size=20, device="cpu")
     model.learn(16, callback=NoBootstrapAtCuts())

@@ -34,7 +34,7 @@ def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> l
 
 def _unpacked(callbacks: list[BaseCallback]) -> Iterator[BaseCallback]:
     for callback in callbacks:
-        if isinstance(callback, CallbackList):
+        if type(callback) is CallbackList:  # a subclass may do more than call its callbacks
             yield from _unpacked(callback.callbacks)
         else:
             yield callback
