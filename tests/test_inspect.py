@@ -20,7 +20,9 @@ from sb3_cchain.analysis.inspection import inspect_model, report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
+from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods import Oracle
+from sb3_cchain.zoo.inspect import _forget_task
 
 OF_PPO = dict(n_steps=32, batch_size=16)
 OF_DQN = dict(learning_starts=10, buffer_size=100)
@@ -175,6 +177,16 @@ def test_to_choose_a_task_is_no_switch(algorithm, make_callback, count, expected
     arguments = ("--env", "Continual/CartPole-v1", "--output", tmp_path, "--env-kwargs", "n_tasks:3")
     inspect(monkeypatch, tmp_path / "model.zip", *arguments, "--task", 0, "--n-steps", 32, "--n-updates", 3)
     assert count(*loaded) == expected
+
+
+def test_the_statistics_stay_where_a_task_is_chosen():
+    env = TaskVecNormalize(make_continual_env())
+    model = make(PPO, env).learn(64, TaskSync())
+    count = env.obs_rms.count
+    _forget_task(model, [])
+    env.env_method("set_task", 0)
+    env.reset()
+    assert env.obs_rms.count == count + 1
 
 
 def test_a_callback_that_ends_the_training_at_once():

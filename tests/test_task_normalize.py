@@ -316,7 +316,8 @@ class RecordStatistics(BaseCallback):
         return True
 
 
-def test_a_task_that_is_chosen_is_no_switch_after_forget_task():
+@pytest.mark.parametrize("is_reset_before", [False, True])
+def test_a_task_that_is_chosen_is_no_switch_after_forget_task(is_reset_before):
     env = TaskVecNormalize(make_sequence())
     env.reset()
     for _ in range(10):
@@ -324,6 +325,8 @@ def test_a_task_that_is_chosen_is_no_switch_after_forget_task():
     for task_id, forgets, count in ((2, True, 12), (1, False, 1)):
         env.env_method("set_task", task_id)
         if forgets:
+            if is_reset_before:
+                env.reset()
             env.forget_task()
         env.reset()
         assert env.obs_rms.count == pytest.approx(count, abs=0.01)

@@ -86,7 +86,10 @@ class TaskVecNormalize(VecNormalize):
 
     def forget_task(self) -> None:
         """Go on with the same statistics in any task that comes next."""
-        self._switch, self._signal_switch = TaskSwitch(), TaskSwitch()
+        switches = {"_switch": TaskSwitch(), "_signal_switch": TaskSwitch()}
+        vars(self).update(switches)
+        if self._before_reset is not None:
+            self._before_reset.update(switches)
 
     def reset(self) -> Observation:
         """
