@@ -37,6 +37,10 @@ _CARTPOLE_DQN: dict[str, Any] = {
     **{"target_update_interval": 10, "train_freq": 256, "gradient_steps": 128},
     **{"exploration_fraction": 0.16, "exploration_final_eps": 0.04},
 }
+_CONTINUAL_CARTPOLE: dict[str, Any] = {
+    **{"steps": 60_000, "eval_freq": 1500, "seeds": 3, "n_tasks": 4},
+    "env_kwargs": {"n_tasks": 4, "steps_per_task": 15_000},
+}
 # SB3's SAC and TD3 are CHAIN's otherwise; its buffer of 1e6 holds everything, as this one does
 _CHAIN: dict[str, Any] = {"learning_starts": 5000, "buffer_size": 150_000}
 _CHAIN_TD3: dict[str, Any] = {**_CHAIN, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}}
@@ -108,12 +112,8 @@ EVIDENCE = {
             "cchain_1e-3": Variant("C-CHAIN QRDQN, β 1e-3 (default)", CChainQRDQN, {"target_churn_ratio": 1e-3}),
             "cchain_1e-4": Variant("C-CHAIN QRDQN, β 1e-4", CChainQRDQN, {"target_churn_ratio": 1e-4}),
         },
-        steps=60_000,
-        eval_freq=1500,
-        seeds=3,
         settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256], "n_quantiles": 10}},
-        env_kwargs={"n_tasks": 4, "steps_per_task": 15_000},
-        n_tasks=4,
+        **_CONTINUAL_CARTPOLE,
     ),
     "dqn_continual_cartpole": Case(
         "Continual CartPole, DQN",
@@ -124,12 +124,8 @@ EVIDENCE = {
             "cchain": Variant("C-CHAIN DQN, β 0.01 (default)", CChainDQN),
             "cchain_1e-3": Variant("C-CHAIN DQN, β 1e-3", CChainDQN, {"target_churn_ratio": 1e-3}),
         },
-        steps=60_000,
-        eval_freq=1500,
-        seeds=3,
         settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256]}},
-        env_kwargs={"n_tasks": 4, "steps_per_task": 15_000},
-        n_tasks=4,
+        **_CONTINUAL_CARTPOLE,
     ),
     "recurrent_ppo_continual_cartpole": Case(
         "Continual CartPole, RecurrentPPO",
