@@ -42,8 +42,9 @@ def main() -> None:
     env_id = args.env or SUITES[args.suite].env_ids[0]
     try:
         check_env_id(args.suite, env_id)
-        paper = paper_length(env_id)
-        n_tasks, steps = args.n_tasks or paper[0], args.steps_per_task or paper[1]
+        n_tasks, steps = paper_length(env_id)
+        n_tasks = n_tasks if args.n_tasks is None else args.n_tasks
+        steps = steps if args.steps_per_task is None else args.steps_per_task
         experiment = f"compare_{n_tasks}x{steps}"
         runs = [
             make_run(args.suite, env_id, method, seed, n_tasks, steps, experiment, args.eval_freq)

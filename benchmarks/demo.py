@@ -32,7 +32,8 @@ def main() -> None:
     args = parser.parse_args()
 
     demo = SUITES[args.suite].demo
-    n_tasks, steps = args.n_tasks or demo.n_tasks, args.steps_per_task or demo.steps_per_task
+    n_tasks = demo.n_tasks if args.n_tasks is None else args.n_tasks
+    steps = demo.steps_per_task if args.steps_per_task is None else args.steps_per_task
     try:
         runs = [
             make_run(args.suite, demo.env_id, method, seed, n_tasks, steps, f"demo_{n_tasks}x{steps}", steps // 5)

@@ -185,17 +185,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     folder = args.output / f"drift_{N_TASKS}x{args.steps_per_task}"
-    results = {}
     for world, seed in _runs(args.worlds, args.seeds):
-        path = folder / world.replace(",", "").replace(" ", "_") / f"seed_{seed}.csv"
+        path = _folder(folder, world) / f"seed_{seed}.csv"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             write(path, train(world, seed, args.steps_per_task))
             print(f"{world}, seed {seed}: done", flush=True)
-        results[world, seed] = read(path)
+    # All that is there, with what was made before
+    results = {
+        (world, seed): read(path)
+        for world in WORLDS
+        for seed, path in sorted((int(path.stem[5:]), path) for path in _folder(folder, world).glob("seed_*.csv"))
+    }
     table = table_of(results, args.steps_per_task)
     (folder / "table.md").write_text(table + "\n")
     print(f"{table}\n\nWritten: {folder}/table.md")
+
+
+def _folder(folder: Path, world: str) -> Path:
+    return folder / world.replace(",", "").replace(" ", "_")
 
 
 def _runs(worlds: Iterable[str], seeds: Sequence[int]) -> list[tuple[str, int]]:

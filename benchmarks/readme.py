@@ -78,9 +78,12 @@ def readme_table(cells: Cells) -> str:
         method: collapses([result for env_id in COLLAPSED for result in cells[env_id, method].results])
         for method in ("vanilla", "cchain")
     }
-    (ppo, n_tasks), (cchain, _) = counts["vanilla"], counts["cchain"]
+    (ppo, ppo_tasks), (cchain, cchain_tasks) = counts["vanilla"], counts["cchain"]
     names = ", ".join(short_name(env_id).split("-")[0] for env_id in COLLAPSED)
-    sentence = f"{names}: of {n_tasks} tasks after a switch, PPO has collapsed at the end of {ppo}, C-CHAIN PPO of {cchain}."
+    sentence = (
+        f"{names}: PPO has collapsed at the end of {ppo} of {ppo_tasks} tasks after a switch, "
+        f"C-CHAIN PPO of {cchain} of {cchain_tasks}."
+    )
     return f"{markdown_table(header, rows)}\n\n{sentence}"
 
 
@@ -126,6 +129,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--write", action="store_true", help="Put table and picture into the README")
     args = parser.parse_args(arguments)
     cells = read_cells(args.results)
+    missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in METHODS if (env_id, method) not in cells]
+    if missing:
+        parser.error(f"--results must have runs of {', '.join(missing)}; there are none in {args.results}")
     table = readme_table(cells)
     print(table)
     if args.write:

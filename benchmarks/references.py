@@ -40,7 +40,10 @@ def variant_run(suite: str, name: str, env_id: str, seed: int, n_tasks: int, ste
     :param n_tasks: Length of the task sequence
     :param steps: Environment steps per task
     :return: The run
+    :raises ValueError: As :func:`~benchmarks.grid.run.make_run`, and for another size in DQN
     """
+    if suite == "minatar" and name == "half":
+        raise ValueError("--variants must be independent or next in minatar, where the reference batch has one size; got half")
     run = make_run(suite, env_id, CCHAIN.name, seed, n_tasks, steps, f"references_{n_tasks}x{steps}")
     return replace(run, variant=name, overrides=OVERRIDES[name])
 

@@ -100,6 +100,9 @@ def test_a_failed_run_names_its_log_and_ends_the_command(run_command, tmp_path):
         (compare, ["--suite", "gym_control", "--method", "nonsense"], "`method` must be one of oracle, .*; got nonsense"),
         (compare, ["--suite", "gym_control", "--env", "Continual/Maze-v0"], "`env_id` must be one of"),
         (references, ["--steps-per-task", "0"], "`steps_per_task` must be at least 1; got 0"),
+        (demo, ["--n-tasks", "0"], "`n_tasks` must be at least 1; got 0"),
+        (compare, ["--suite", "gym_control", "--steps-per-task", "0"], "`steps_per_task` must be at least 1; got 0"),
+        (references, ["--suite", "minatar", "--n-tasks", "1"], "--variants must be independent or next in minatar"),
     ],
 )
 def test_errors_come_before_any_work(run_command, tmp_path, capsys, command, arguments, message):

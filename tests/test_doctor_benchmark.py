@@ -87,6 +87,10 @@ def test_trains_and_inspects_what_is_missing(small, tmp_path, capsys):
     command.main(["--again", *arguments])
     assert "sick@16: short_horizon" in capsys.readouterr().out
     assert (tmp_path / "results" / "models.csv").read_text() == rows
+    # Those of other cases stay
+    command.main(["--again", "--case", "healthy", *arguments])
+    assert "healthy@16:" in (shown := capsys.readouterr().out) and "sick@16:" not in shown
+    assert (tmp_path / "results" / "models.csv").read_text() == rows
 
 
 def test_models_are_of_their_ages(small, tmp_path):

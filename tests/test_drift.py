@@ -1,6 +1,7 @@
 """The detector of drift on series that are known, and what its benchmark makes of it."""
 
 import pickle
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,12 @@ def test_the_benchmark_runs(tmp_path, capsys):
     benchmark.main([*arguments, "--worlds", "CartPole, poles of other lengths"])  # from what was recorded
     assert (tmp_path / "drift_3x512" / "table.md").read_text() == first
     assert "seed 0: done" in capsys.readouterr().out
+    # The table is of all that is there
+    worlds = tmp_path / "drift_3x512"
+    shutil.copytree(worlds / "CartPole_poles_of_other_lengths", worlds / benchmark._folder(worlds, benchmark.UNCHANGED).name)
+    benchmark.main([*arguments, "--worlds", "CartPole, poles of other lengths"])
+    table = (worlds / "table.md").read_text()
+    assert table.count(f"| {benchmark.UNCHANGED} |") == 6 == table.count("| CartPole, poles of other lengths |")
 
 
 def test_poles_differ():

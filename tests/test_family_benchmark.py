@@ -1,5 +1,7 @@
 """The command ``benchmarks.family``: its runs, and its tables of results written by hand."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -186,6 +188,33 @@ def test_runs_that_are_done_are_not_made_again(runs):
     for run in runs:
         write(run, [0] * 8)
     assert list(train_all(runs, 1)) == []
+
+
+@pytest.mark.parametrize("error", [ValueError("boom"), KeyboardInterrupt()])
+def test_no_run_begins_after_an_error(runs, monkeypatch, error):
+    begun = []
+
+    class Threads(ThreadPoolExecutor):
+        def __init__(self, n_jobs, **_):
+            super().__init__(n_jobs)
+
+    def fail_soon(run):
+        begun.append(run)
+        if len(begun) == 1:
+            raise error
+        time.sleep(0.2)
+
+    monkeypatch.setattr(training, "ProcessPoolExecutor", Threads)
+    monkeypatch.setattr(training, "train", fail_soon)
+    with pytest.raises(type(error)):
+        list(train_all(10 * runs, 2))
+    assert len(begun) < 6
+
+
+def test_a_run_that_another_process_made_is_left_as_it_is(runs):
+    write(runs[0], [0] * 8)
+    before = runs[0].result.read_text()
+    assert train(runs[0]) == runs[0] and runs[0].result.read_text() == before
 
 
 def test_the_command(runs, tmp_path, capsys):

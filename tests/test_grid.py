@@ -245,6 +245,13 @@ def test_another_strength_is_a_line_of_its_own(tmp_path):
     assert Rates([result]).seconds(replace(run, n_tasks=1, steps_per_task=200)) == 100.0
     write_result(make_result(tmp_path, run), ROWS, [])
     assert find_result(run, tmp_path).line == "cchain@1e3" and find_result(plain, tmp_path) is None
+    # The shipped strength is the method itself
+    assert make_run("gym_control", *cartpole, "cchain@10000", 0, 10, 16_000, "reduced") == make_run(
+        "gym_control", *cartpole, "cchain", 0, 10, 16_000, "reduced"
+    )
+    assert [run.line for run in grid_runs(["gym_control"], cartpole, ["cchain@1e4", "vanilla", "cchain"], 1)] == [
+        *("cchain", "vanilla")
+    ]
     evaluated = make_run("minatar", "Continual/MinAtar-v0", "cchain@0.1", 0, 3, 3000, "smoke")
     assert (evaluated.eval_freq, evaluated.line, evaluated.algo) == (100, "cchain@0.1", "dqn_cchain")
 
@@ -519,6 +526,8 @@ def test_rates_by_hand(tmp_path):
     assert Rates([]).seconds(replace(paper, method="weight_clipping")) == pytest.approx(2.0)
     results = [make_result(tmp_path, RUN, seconds=1000.0), make_result(tmp_path, acrobot, seconds=16.0)]
     results.append(make_result(tmp_path, replace(acrobot, seed=1), seconds=48.0))
+    # On another device
+    results.append(make_result(tmp_path, replace(paper, seed=2), seconds=1.0, command=["train", "--device", "cuda"]))
     # Of the suite, 3200 steps in 64 seconds, not of smoke runs, though of the same environment
     assert Rates(results).seconds(paper) == pytest.approx(20.0)
     results.append(make_result(tmp_path, replace(RUN, experiment="reduced"), seconds=16.0))

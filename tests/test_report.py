@@ -308,23 +308,28 @@ def test_table_of_tasks_by_hand(tmp_path):
 def test_table_of_plasticity_by_hand(tmp_path):
     # The Oracle's curve in the second task: 10 until step 110, a line to 20 at 120, then level: 0.1 of 10, of 15, 0.8 of 20
     write(tmp_path, "oracle", [[10.0, 10.0], [10.0, 20.0]])
+    write(tmp_path, "oracle", [[30.0, 30.0], [30.0, 30.0]], seed=1)
     write(tmp_path, "vanilla", [[10.0, 12.0], [5.0, 5.0]], metrics=[(100, "continual_eval/forgetting", 9.0)])
     write(tmp_path, "vanilla", [[10.0, 8.0], [5.0, 15.0]], seed=1)
+    # Without an Oracle of its tasks
+    write(tmp_path, "vanilla", [[1000.0, 1000.0], [-1000.0, -1000.0]], seed=2)
     write(tmp_path, "cchain", [[10.0, 10.0], [20.0, 30.0]], metrics=[(200, "continual_eval/forgetting", 1.0)])
     runs = whole_results(tmp_path)
     header, _, *rows = table_rows(continual_table(runs, GYM_LINES, 1, own_scales=False))
     cells = {row[0]: dict(zip(header[1:], row[1:], strict=True)) for row in rows}
     oracle, vanilla, cchain = (cells[GYM_LINES[name].label] for name in ("oracle", "vanilla", "cchain"))
-    assert vanilla["seeds"] == "0 1" and vanilla["forgetting"] == "9.0" and cchain["forgetting"] == "1.0"
-    assert (vanilla["gap, first task"], vanilla["gap, last task"]) == ("0.0", "7.5")
+    assert vanilla["seeds"] == "0 1 2" and vanilla["forgetting"] == "9.0" and cchain["forgetting"] == "1.0"
+    # Of the Oracle's means with seeds 0 and 1: (10 + 30) / 2 - (11 + 9) / 2, (15 + 30) / 2 - (5 + 10) / 2
+    assert (vanilla["gap, first task"], vanilla["gap, last task"]) == ("10.0", "15.0")
+    # Seed 0 alone
     assert (cchain["gap, first task"], cchain["gap, last task"]) == ("0.0", "-10.0")
     # The best is 30. Vanilla's areas are 5 and 0.1 of 5, 0.1 of 10, 0.8 of 15; C-CHAIN's 0.1 of 20, of 25, of 30
-    assert vanilla["forward transfer"] == f"{((5 + 13.5) / 2 - 18.5) / 11.5:.2f}"
+    assert vanilla["forward transfer"] == f"{((5 + 13.5) / 2 - (18.5 + 30) / 2) / (30 - (18.5 + 30) / 2):.2f}"
     assert cchain["forward transfer"] == f"{(28.5 - 18.5) / 11.5:.2f}"
     # To 11, never; to 9, by the second rollout, 100 steps after the last of the task before
-    assert (vanilla["recovered"], vanilla["steps to recover"]) == ("1 of 2", "100")
+    assert (vanilla["recovered"], vanilla["steps to recover"]) == ("1 of 3", "100")
     assert (cchain["recovered"], cchain["steps to recover"]) == ("1 of 1", "90")
-    assert (oracle["gap, last task"], oracle["forward transfer"], oracle["recovered"]) == ("–", "–", "1 of 1")
+    assert (oracle["gap, last task"], oracle["forward transfer"], oracle["recovered"]) == ("–", "–", "2 of 2")
 
 
 def test_table_of_plasticity_without_its_data(tmp_path):
@@ -541,6 +546,12 @@ def test_whole_report(whole_report):
     assert "| Acrobot-v1 | 2 × 100 | 10 × 160,000 |" in text and "not expected to agree" in text
     assert "Left out, because they do not have runs in all of them: Oracle, TRAC, Weight clipping, L2 Init." in text
     assert "| PPO | 1.00 [1.00, 1.00] | 2 of 2 | 2 of 2 |" in text
+    # Two commands that make just the runs of the page
+    command = "python -m benchmarks.run --suite gym_control --budget smoke"
+    assert [line for line in text.splitlines() if line.startswith(command) and "--seeds" in line] == [
+        f"{command} --env Continual/Acrobot-v1 Continual/CartPole-v1 --method vanilla cchain --seeds 2",
+        f"{command} --env Continual/Acrobot-v1 --method oracle --seeds 1",
+    ]
     assert "9 runs, 9.0 hours" in text and not re.search(r"\bnan\b|None", text)
     pictures = sorted(re.findall(r"\]\((pictures/.*?)\)", text))
     assert pictures == sorted(str(path.relative_to(folder)) for path in folder.glob("pictures/*.png"))
@@ -1042,6 +1053,11 @@ def test_best_of_betas_by_hand(tmp_path):
     row = table_rows(best_table([best], read_tables()["gym_control"]))[2]
     here = ["-90.0 (best of 3: β = 1e5)", "-110.0 (β = 1e4)", "-119.2 ± 6.9 (best of 3)"]
     assert row == ["Acrobot-v1, C-CHAIN PPO", "β = 1e3, 1e4, 1e5", "0 1", *here, "not enough runs: 2 seeds, other length"]
+    # Further seeds of the best alone do not count
+    for seed in (2, 3):
+        write(tmp_path, "cchain", [[0], [0]], seed=seed, variant="cchain@1e5", overrides=("target_churn_ratio:1e5",))
+    (best,) = best_strengths("gym_control", cells_in(tmp_path), [ACROBOT])
+    assert table_rows(best_table([best], read_tables()["gym_control"]))[2] == row
     write_best([best], tmp_path / "best_of.csv")
     header, line = (tmp_path / "best_of.csv").read_text().splitlines()
     assert header == ",".join(COLUMNS)
@@ -1120,7 +1136,7 @@ def test_metrics_by_the_oracle(tmp_path, oracle, mean, no_drawing):
     assert f"| C-CHAIN PPO | 0 1 | {expected} [{expected}, {expected}] |" in text
     ratio = f"{printed['cchain'] / printed['oracle']:.2f}"
     assert f"| C-CHAIN PPO, paper | – | {ratio} | {ratio} | – | – |" in text
-    assert ("the paper's Oracle (it has no runs here)" in text) is not oracle
+    assert ("the paper's Oracle (without runs in some of them here)" in text) is not oracle
     assert "pictures/metrics_by_oracle_procgen.png" in text
 
 

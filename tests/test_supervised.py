@@ -190,9 +190,22 @@ def test_results_of_other_settings_are_refused(images, make_run):
     other = Images(images.source, images.pixels + 1, images.labels)
     with pytest.raises(ValueError, match="was made with checksum"):
         train(make_run(), other, 2)
+    # Another seed of the same method, with which the table would average it
+    with pytest.raises(ValueError, match=r"cchain_seed_0 was made with learning_rate 0\.001 instead of 0\.01"):
+        train(make_run(learning_rate=0.01, seed=1), images, 1)
     (make_run().folder / "run.json").unlink()
     with pytest.raises(ValueError, match=r"state\.pt was made with other settings"):
         train(make_run(learning_rate=0.01), images, 2)
+
+
+def test_results_are_kept_where_the_run_cannot_go_on(images, make_run):
+    run = make_run()
+    train(run, images, 2)
+    run.state.unlink()
+    with pytest.raises(ValueError, match=r"has 2 tasks, but .*state\.pt, from which the run would go on, is missing"):
+        train(run, images, 3)
+    assert n_done(run) == 2
+    train(run, images, 2)
 
 
 # --- Images

@@ -39,8 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     th.set_num_threads(1)
     warnings.simplefilter("ignore")  # sick models give many
     all_patients, path = patients(args.models), args.results / "models.csv"
-    known = {} if args.again else {e.patient.name: e for e in read(path, all_patients)}
-    for name in args.case or CASES:
+    chosen = args.case or list(CASES)
+    # With --again a file of older measures need not be readable, but what is not inspected again stays
+    kept = [patient for patient in all_patients if not (args.again and patient.case_name in chosen)]
+    known = {e.patient.name: e for e in read(path, kept)}
+    for name in chosen:
         missing = [patient for patient in all_patients if patient.case_name == name and patient.name not in known]
         train_missing(missing)
         for patient in missing:

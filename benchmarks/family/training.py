@@ -98,8 +98,13 @@ def train_all(runs: Sequence[Run], n_jobs: int) -> Iterator[Run]:
     # A process for each run, where Python can
     fresh: dict[str, Any] = {"max_tasks_per_child": 1} if sys.version_info >= (3, 11) else {}
     with ProcessPoolExecutor(n_jobs, mp_context=get_context("spawn"), **fresh) as pool:
-        for done in as_completed([pool.submit(train, run) for run in waiting]):
-            yield done.result()
+        try:
+            for done in as_completed([pool.submit(train, run) for run in waiting]):
+                yield done.result()
+        except BaseException:
+            # Else the pool would make all runs that wait, before the error or Ctrl-C shows
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def train(run: Run) -> Run:
@@ -109,6 +114,9 @@ def train(run: Run) -> Run:
     :param run: The run
     :return: It
     """
+    if run.result.exists():
+        # Another process has made it meanwhile
+        return run
     th.set_num_threads(1)
     case, variant = run.case, run.variant
     evaluation = _evaluation(run)

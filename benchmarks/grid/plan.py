@@ -71,7 +71,7 @@ def grid_runs(
     _check_names("method", [method for method, _ in lines], [name for name in METHOD_NAMES if name in available], suites)
     if n_seeds is not None and n_seeds < 1:
         raise ValueError(f"--seeds must be at least 1; got {n_seeds}")
-    grid = []
+    grid: dict[Run, tuple[int, int]] = {}
     for suite, env_id in all_envs:
         if env_ids is not None and env_id not in env_ids:
             continue
@@ -84,12 +84,13 @@ def grid_runs(
             for rank, (method, strength) in enumerate(chosen):
                 line = method if strength is None else f"{method}@{strength}"
                 run = make_run(suite, env_id, line, seed, n_tasks, steps, budget, eval_freq)
-                grid.append((seed, rank, run))
+                # The shipped strength may be given beside the method's plain name
+                grid.setdefault(run, (seed, rank))
     if not grid:
         raise ValueError(
             f"--method must be one with hyperparameters for {', '.join(env_ids or suites)}; got {', '.join(methods or ())}"
         )
-    return [run for *_, run in sorted(grid, key=lambda entry: entry[:2])]
+    return sorted(grid, key=grid.__getitem__)
 
 
 def shelf_runs(
@@ -109,7 +110,7 @@ def shelf_runs(
     :raises ValueError: As :func:`grid_runs`
     """
     methods = methods or list(suite_methods(SHELF_SUITES[0]))
-    return grid_runs(SHELF_SUITES, env_ids or SHELF_ENVS, methods, n_seeds or SHELF_SEEDS, budget)
+    return grid_runs(SHELF_SUITES, env_ids or SHELF_ENVS, methods, SHELF_SEEDS if n_seeds is None else n_seeds, budget)
 
 
 def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:
@@ -126,7 +127,7 @@ def _check_names(option: str, given: Iterable[str] | None, allowed: Sequence[str
 class Rates:
     """
     How long a run will take: from the results in its environment with its method, else in its suite with its method, else
-    from the suite's row. Those of ``APART`` are used for each other only.
+    from the suite's row. Those of ``APART`` are used for each other only, and those on a GPU for none.
 
     :param results: Results of any experiment
     """
@@ -134,6 +135,8 @@ class Rates:
     def __init__(self, results: Iterable[Result]):
         self._totals: dict[tuple, tuple[int, float]] = {}
         for result in results:
+            if "cuda" in result.command:
+                continue
             for key in self._keys(result):
                 steps, seconds = self._totals.get(key, (0, 0.0))
                 self._totals[key] = (steps + result.total_steps, seconds + result.seconds)

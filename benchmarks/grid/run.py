@@ -154,7 +154,7 @@ def make_run(
     """
     :param suite: Name of the suite
     :param env_id: One of its environments
-    :param method: Name of a method, with another strength as in ``cchain@1e3``
+    :param method: Name of a method, with another strength as in ``cchain@1e3``; with the shipped one it is the method itself
     :param seed: Seed
     :param n_tasks: Length of the task sequence
     :param steps_per_task: Environment steps per task
@@ -175,7 +175,7 @@ def make_run(
     if "n_tasks" not in SUITES[suite].env_kwargs(n_tasks, seed) and n_tasks > paper_length(env_id)[0]:
         raise ValueError(f"`n_tasks` must be at most {paper_length(env_id)[0]}, the tasks of {env_id}; got {n_tasks}")
     run = Run(suite, env_id, method, seed, n_tasks, steps_per_task, experiment)
-    if strength is not None:
+    if strength is not None and strength != strength_of(run):
         differing = with_strength(_strength(run), run.settings["hyperparameters"], strength)
         run = replace(run, variant=f"{method}@{strength}", overrides=(strength_override(differing, strength),))
     evaluation = SUITES[suite].evaluation

@@ -52,6 +52,11 @@ class Best:
     strength: str
     shipped: str | None
 
+    @property
+    def cell(self) -> Cell:
+        """That of the best strength, with ``seeds`` alone."""
+        return self.cells[self.strength].with_seeds(self.seeds)
+
     def mean(self, strength: str | None) -> float | None:
         """
         :param strength: A strength
@@ -117,7 +122,7 @@ def best_table(found: Sequence[Best], paper: Table) -> str:
         lacking = [value for value in of_paper if value not in best.cells]
         words, printed = MISSING, MISSING
         if figure is not None:
-            words = verdict_words(best.cells[best.strength], figure, paper.lengths[best.env_id])
+            words = verdict_words(best.cell, figure, paper.lengths[best.env_id])
             if lacking:
                 words = f"{TOO_FEW}: {symbol} = {', '.join(lacking)} missing"
             printed = f"{figure.mean:.{digits}f} ± {figure.standard_error:.{digits}f} "

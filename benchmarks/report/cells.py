@@ -1,7 +1,7 @@
 """The cells of a table: runs of one method in one environment that differ in their seed alone."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -41,6 +41,14 @@ class Cell:
     def seeds(self) -> list[int]:
         """Seeds of the runs."""
         return [result.seed for result in self.results]
+
+    def with_seeds(self, seeds: Container[int]) -> "Cell":
+        """
+        :param seeds: Some of its seeds
+        :return: A cell of their runs
+        """
+        runs = [(run, score) for run, score in zip(self.results, self.scores, strict=True) if run.seed in seeds]
+        return Cell(tuple(run for run, _ in runs), tuple(score for _, score in runs))
 
     @property
     def mean(self) -> float:

@@ -15,7 +15,8 @@ HEADER = ["method", "seeds", "gap, first task", "gap, last task", "forward trans
 
 WORDS = """\
 Means over the seeds. The **gap** of a task is J(T_i) of the Oracle, whose networks are fresh in each task, minus J(T_i) of
-the method (Section 3.2 of the paper): a gap that grows is plasticity lost. **Forward transfer** is the share of what the
+the method (Section 3.2 of the paper): a gap that grows is plasticity lost. It and forward transfer are of the seeds that the
+Oracle has, too, because the seed may draw the tasks. **Forward transfer** is the share of what the
 Oracle lacks to the best, as areas under the learning curves, that the method gains, mean over the tasks from the second on
 (Wołczyk et al., 2021; the best is the highest return of a rollout in that task by any run here): less than 0 is worse than
 fresh networks. **Recovered** counts the switches after which a rollout's mean return reached that of the last five rollouts of
@@ -32,7 +33,7 @@ def continual_table(results: Sequence[Result], lines: Mapping[str, Method], digi
     :param own_scales: Whether tasks differ in the size of their returns, so that there is no level to recover to
     :return: A row for each method; what needs the Oracle is missing without its runs
     """
-    fresh = [run for run in results if run.method == "oracle"]
+    fresh = {run.seed: run for run in results if run.method == "oracle"}
     best = [
         max((max(run.returns_in_task(task)[1], default=-np.inf) for run in results), default=np.nan)
         for task in range(results[0].n_tasks)
@@ -44,9 +45,10 @@ def continual_table(results: Sequence[Result], lines: Mapping[str, Method], digi
         if not runs:
             continue
         cells = [method.label, seeds_text(sorted(run.seed for run in runs)), *[MISSING] * 5]
-        if fresh and runs[0].method != "oracle":
-            gap = plasticity_gap(_averages(runs), _averages(fresh))
-            transfer = forward_transfer(_areas(runs), _areas(fresh), best)[1:]
+        if runs[0].method != "oracle" and (paired := [run for run in runs if run.seed in fresh]):
+            oracles = [fresh[run.seed] for run in paired]
+            gap = plasticity_gap(_averages(paired), _averages(oracles))
+            transfer = forward_transfer(_areas(paired), _areas(oracles), best)[1:]
             cells[2:5] = [
                 _text(gap[0], digits),
                 _text(gap[-1], digits),
@@ -80,4 +82,5 @@ def _areas(runs: Sequence[Result]) -> np.ndarray:
 
 
 def _text(value: float | np.floating, digits: int) -> str:
-    return MISSING if np.isnan(value) else f"{value:.{digits}f}"
+    # Without the sign of -0.00
+    return MISSING if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"

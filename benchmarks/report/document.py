@@ -333,11 +333,9 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
     counted = [f"- {n} runs at {escaped(name)}" for name, n in commits.items()]
     budget = shlex.quote(" ".join(experiment.split()))
     commands = []
-    for suite in dict.fromkeys(result.suite for result in results):
-        runs = [result for result in results if result.suite == suite]
-        methods = " ".join(lines_in_order(run.line for run in runs))
-        n_seeds = 1 + max(run.seed for run in runs)
-        commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} --method {methods} --seeds {n_seeds}")
+    for (suite, n_seeds, methods), env_ids in _same_runs(results).items():
+        options = f"--env {' '.join(env_ids)} --method {' '.join(methods)} --seeds {n_seeds}"
+        commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} {options}")
     commands.append(f"python -m benchmarks.report --budget {budget}")
     parts = [
         "## The runs",
@@ -350,3 +348,18 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
     if left_out:
         parts += ["These are left out:", "\n".join(f"- {escaped(reason)}" for reason in left_out)]
     return "\n\n".join(parts)
+
+
+def _same_runs(results: Sequence[Result]) -> dict[tuple[str, int, tuple[str, ...]], list[str]]:
+    """By suite, number of seeds and methods, the environments that have just these methods with this number of seeds."""
+    n_seeds: dict[tuple[str, str, str], int] = {}
+    for run in results:
+        key = run.suite, run.env_id, run.line
+        n_seeds[key] = max(n_seeds.get(key, 0), run.seed + 1)
+    lines: dict[tuple[str, str, int], list[str]] = {}
+    for (suite, env_id, line), n in n_seeds.items():
+        lines.setdefault((suite, env_id, n), []).append(line)
+    env_ids: dict[tuple[str, int, tuple[str, ...]], list[str]] = {}
+    for (suite, env_id, n), there in lines.items():
+        env_ids.setdefault((suite, n, tuple(lines_in_order(there))), []).append(env_id)
+    return env_ids

@@ -106,7 +106,7 @@ def _over_oracle(
         ]
         for method, ratios in printed.items()
     ]
-    whose = "the Oracle's runs here" if "oracle" in scores else "the paper's Oracle (it has no runs here)"
+    whose = "the Oracle's runs here" if "oracle" in scores else "the paper's Oracle (without runs in some of them here)"
     scaled = {method: matrix / oracle for method, matrix in scores.items()}
     return [ORACLE_WORDS.format(oracle=whose), *_metrics(suite, "metrics_by_oracle", scaled, seeds, rows, pictures)]
 

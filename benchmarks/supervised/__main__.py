@@ -24,7 +24,7 @@ from benchmarks.supervised.learner import METHODS, OPTIMIZERS, Settings
 from benchmarks.supervised.picture import plot
 from benchmarks.supervised.tables import read_results, results_table
 from benchmarks.supervised.tasks import PROBLEMS
-from benchmarks.supervised.training import Progress, Run, check_settings, n_done, train, updates_per_second
+from benchmarks.supervised.training import Progress, Run, check_settings, check_state, n_done, train, updates_per_second
 from sb3_cchain.validation import check_number
 
 PICTURE = "images/supervised.png"
@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             images = load_images(args.data)
             for run in runs:
                 check_settings(run, images)
+                check_state(run, length(run, args.tasks))
         except (ImportError, ValueError) as error:
             parser.error(str(error))
         if args.dry_run:

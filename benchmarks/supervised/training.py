@@ -140,16 +140,32 @@ def check_settings(run: Run, images: Images) -> None:
     """
     :param run: A run
     :param images: The images
-    :raises ValueError: When its results were made with other settings
+    :raises ValueError: When its results, or those of another seed, were made with other settings
     """
-    path = run.folder / "run.json"
-    if not path.exists():
-        return
-    known, wanted = read_about(run.folder)["settings"], run.description(images)
-    differing = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
-    if differing:
-        words = ", ".join(f"{name} {known.get(name)!r} instead of {wanted.get(name)!r}" for name in differing)
-        raise ValueError(f"{run.folder} was made with {words}. Delete it, or give other folders by --results and --logs")
+    wanted = run.description(images)
+    for path in sorted(run.folder.parent.glob(f"{run.method}_seed_*/run.json")):
+        known = read_about(path.parent)["settings"]
+        if path.parent != run.folder:
+            # The table shows their mean
+            known["seed"] = run.seed
+        differing = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
+        if differing:
+            words = ", ".join(f"{name} {known.get(name)!r} instead of {wanted.get(name)!r}" for name in differing)
+            raise ValueError(f"{path.parent} was made with {words}. Delete it, or give other folders by --results and --logs")
+
+
+def check_state(run: Run, n_tasks: int) -> None:
+    """
+    :param run: A run
+    :param n_tasks: Number of tasks that it is to do
+    :raises ValueError: When it has done some of them, but what it would go on from is gone
+    """
+    n_finished = n_done(run)
+    if 0 < n_finished < n_tasks and not run.state.exists():
+        raise ValueError(
+            f"{run.folder} has {n_finished} tasks, but {run.state}, from which the run would go on, is missing. Delete the "
+            "results to begin anew, or give other folders by --results and --logs"
+        )
 
 
 def train(run: Run, images: Images, n_tasks: int, after_task: Callable[[Progress], None] = lambda progress: None) -> Progress:
@@ -164,9 +180,11 @@ def train(run: Run, images: Images, n_tasks: int, after_task: Callable[[Progress
     :param n_tasks: Number of tasks
     :param after_task: Called after each task, and before the first one
     :return: What has been done
-    :raises ValueError: When its results were made with other settings, or another process is making it
+    :raises ValueError: When its results were made with other settings, what it goes on from is gone, or another process is
+        making it
     """
     check_settings(run, images)
+    check_state(run, n_tasks)
     th.set_num_threads(1)
     run.state.parent.mkdir(parents=True, exist_ok=True)
     with open_locked(run.state.with_name("lock"), f"Another process is making {run.name}"), _without_subnormals():
