@@ -40,24 +40,31 @@ def hidden_layers(
     return modules, n_inputs
 
 
-class _MlpVariant(ActorCriticPolicy):
+class _Hidden:
+    """What the variants of SB3's policies have in common: how they make the hidden layers of a network."""
+
     layer_norm: ClassVar[bool] = False
     linear: ClassVar[type[nn.Linear]] = nn.Linear
+    activation_fn: type[nn.Module]
+
+    def _make_hidden(self, n_inputs: int, net_arch: list[int]) -> tuple[nn.Sequential, int]:
+        """The hidden layers, and the number of their outputs."""
+        modules, n_outputs = hidden_layers(n_inputs, net_arch, self.activation_fn, self.layer_norm, self.linear)
+        return nn.Sequential(*modules), n_outputs
+
+
+class ActorCriticVariant(_Hidden, ActorCriticPolicy):
+    """SB3's ``MlpPolicy`` for PPO and A2C with other hidden layers."""
 
     def _build_mlp_extractor(self) -> None:
-        if isinstance(self.net_arch, dict):
-            pi, vf = self.net_arch.get("pi", []), self.net_arch.get("vf", [])
-        else:
-            pi = vf = self.net_arch
+        net_arch = self.net_arch if isinstance(self.net_arch, dict) else dict(pi=self.net_arch, vf=self.net_arch)
         extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
-        settings = (self.activation_fn, self.layer_norm, self.linear)
-        policy_net, extractor.latent_dim_pi = hidden_layers(self.features_dim, pi, *settings)
-        value_net, extractor.latent_dim_vf = hidden_layers(self.features_dim, vf, *settings)
-        extractor.policy_net, extractor.value_net = nn.Sequential(*policy_net), nn.Sequential(*value_net)
+        extractor.policy_net, extractor.latent_dim_pi = self._make_hidden(self.features_dim, net_arch.get("pi", []))
+        extractor.value_net, extractor.latent_dim_vf = self._make_hidden(self.features_dim, net_arch.get("vf", []))
         self.mlp_extractor: MlpExtractor = extractor.to(self.device)
 
 
-class LayerNormPolicy(_MlpVariant):
+class LayerNormPolicy(ActorCriticVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C with a LayerNorm (https://arxiv.org/abs/1607.06450; against the loss of plasticity:
     Lyle et al. 2024, https://arxiv.org/abs/2402.18762) in each hidden layer, after the linear map and before the activation.
@@ -71,7 +78,7 @@ class LayerNormPolicy(_MlpVariant):
     layer_norm = True
 
 
-class CReLUPolicy(_MlpVariant):
+class CReLUPolicy(ActorCriticVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C with :class:`CReLU` as activation: a layer of ``n`` units in ``net_arch`` has ``2 n``
     outputs, so every layer but the first has twice as many weights.
@@ -84,7 +91,7 @@ class CReLUPolicy(_MlpVariant):
         super().__init__(*args, **{"activation_fn": CReLU, **kwargs})
 
 
-class FourierPolicy(_MlpVariant):
+class FourierPolicy(ActorCriticVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C with :class:`FourierFeatures` as activation: a layer of ``n`` units in ``net_arch`` has
     ``2 n`` outputs, as with :class:`CReLUPolicy`.
@@ -97,7 +104,7 @@ class FourierPolicy(_MlpVariant):
         super().__init__(*args, **{"activation_fn": FourierFeatures, **kwargs})
 
 
-class SpectralNormPolicy(_MlpVariant):
+class SpectralNormPolicy(ActorCriticVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C whose hidden layers are divided by their greatest singular value, as
     :class:`SpectralNormLinear` describes. The output layers are not, so the outputs can grow; neither are those of a features
@@ -118,27 +125,20 @@ class SpectralNormPolicy(_MlpVariant):
                 module.iterate(15)  # for the weights of `ortho_init`
 
 
-class _QNetworkVariant(QNetwork):
-    def __init__(self, *args: Any, layer_norm: bool, linear: type[nn.Linear], **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        modules, n_features = hidden_layers(self.features_dim, self.net_arch, self.activation_fn, layer_norm, linear)
-        self.q_net = nn.Sequential(*modules, nn.Linear(n_features, int(self.action_space.n)))
-
-
-class _DQNVariant(DQNPolicy):
-    layer_norm: ClassVar[bool] = False
-    linear: ClassVar[type[nn.Linear]] = nn.Linear
+class DQNVariant(_Hidden, DQNPolicy):
+    """SB3's ``MlpPolicy`` for DQN with other hidden layers."""
 
     def make_q_net(self) -> QNetwork:
         """
         :return: A Q-network
         """
-        # Extractors of their own for the network and its target, as in SB3
-        net_args = self._update_features_extractor(self.net_args, features_extractor=None)
-        return _QNetworkVariant(**net_args, layer_norm=self.layer_norm, linear=self.linear).to(self.device)
+        network = super().make_q_net()
+        hidden, n_features = self._make_hidden(network.features_dim, network.net_arch)
+        network.q_net = nn.Sequential(*hidden, nn.Linear(n_features, int(network.action_space.n)))
+        return network.to(self.device)
 
 
-class LayerNormDQNPolicy(_DQNVariant):
+class LayerNormDQNPolicy(DQNVariant):
     """
     SB3's ``MlpPolicy`` for DQN with a LayerNorm in each hidden layer, as in :class:`LayerNormPolicy`. All arguments are those
     of ``DQNPolicy``, with the same defaults.
@@ -147,7 +147,7 @@ class LayerNormDQNPolicy(_DQNVariant):
     layer_norm = True
 
 
-class SpectralNormDQNPolicy(_DQNVariant):
+class SpectralNormDQNPolicy(DQNVariant):
     """
     SB3's ``MlpPolicy`` for DQN with hidden layers of spectral norm 1, as in :class:`SpectralNormPolicy`. All arguments are
     those of ``DQNPolicy``, with the same defaults.
@@ -156,7 +156,7 @@ class SpectralNormDQNPolicy(_DQNVariant):
     linear = SpectralNormLinear
 
 
-class CReLUDQNPolicy(_DQNVariant):
+class CReLUDQNPolicy(DQNVariant):
     """
     SB3's ``MlpPolicy`` for DQN with :class:`CReLU` as activation, as in :class:`CReLUPolicy`.
 
@@ -168,7 +168,7 @@ class CReLUDQNPolicy(_DQNVariant):
         super().__init__(*args, **{"activation_fn": CReLU, **kwargs})
 
 
-class FourierDQNPolicy(_DQNVariant):
+class FourierDQNPolicy(DQNVariant):
     """
     SB3's ``MlpPolicy`` for DQN with :class:`FourierFeatures` as activation, as in :class:`FourierPolicy`.
 

@@ -3,13 +3,14 @@
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy, ContinuousCritic
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
+
+from sb3_cchain.networks.mlp_policies import ActorCriticVariant, DQNVariant
 
 
 class SimBaBlock(nn.Module):
@@ -60,7 +61,7 @@ class SimBaTrunk(nn.Sequential):
         nn.init.orthogonal_(self[0].weight)  # type: ignore[arg-type]
 
 
-class SimBaPolicy(ActorCriticPolicy):
+class SimBaPolicy(ActorCriticVariant):
     """
     SB3's ``MlpPolicy`` for PPO and A2C with the network of SimBa in place of the hidden layers: a linear layer, residual
     blocks that begin with a LayerNorm, and a LayerNorm at the end.
@@ -82,15 +83,8 @@ class SimBaPolicy(ActorCriticPolicy):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"net_arch": dict(pi=[128], vf=[512, 512]), **kwargs})
 
-    def _build_mlp_extractor(self) -> None:
-        if isinstance(self.net_arch, dict):
-            pi, vf = self.net_arch.get("pi", []), self.net_arch.get("vf", [])
-        else:
-            pi = vf = self.net_arch
-        extractor = MlpExtractor(self.features_dim, [], self.activation_fn, self.device)
-        extractor.policy_net, extractor.latent_dim_pi = SimBaTrunk(self.features_dim, pi), pi[-1]
-        extractor.value_net, extractor.latent_dim_vf = SimBaTrunk(self.features_dim, vf), vf[-1]
-        self.mlp_extractor = extractor.to(self.device)
+    def _make_hidden(self, n_inputs: int, net_arch: list[int]) -> tuple[nn.Sequential, int]:
+        return SimBaTrunk(n_inputs, net_arch), net_arch[-1]
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
@@ -99,21 +93,7 @@ class SimBaPolicy(ActorCriticPolicy):
             trunk.reset_parameters()  # which `ortho_init` has initialised otherwise
 
 
-class SimBaQNetwork(QNetwork):
-    """
-    SB3's Q-network with a :class:`SimBaTrunk` in place of the hidden layers.
-
-    :param args: Arguments of ``QNetwork``
-    :param kwargs: Keyword arguments of ``QNetwork``
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        trunk = SimBaTrunk(self.features_dim, self.net_arch)
-        self.q_net = nn.Sequential(trunk, nn.Linear(self.net_arch[-1], int(self.action_space.n)))
-
-
-class SimBaDQNPolicy(DQNPolicy):
+class SimBaDQNPolicy(DQNVariant):
     """
     SB3's ``MlpPolicy`` for DQN with the network of SimBa, as :class:`SimBaPolicy`. ``net_arch`` is a list of the blocks'
     widths; the default ``[512, 512]`` is that of the paper's critics.
@@ -126,12 +106,8 @@ class SimBaDQNPolicy(DQNPolicy):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"net_arch": [512, 512], **kwargs})
 
-    def make_q_net(self) -> QNetwork:
-        """
-        :return: A Q-network
-        """
-        net_args = self._update_features_extractor(self.net_args, features_extractor=None)
-        return SimBaQNetwork(**net_args).to(self.device)
+    def _make_hidden(self, n_inputs: int, net_arch: list[int]) -> tuple[nn.Sequential, int]:
+        return nn.Sequential(SimBaTrunk(n_inputs, net_arch)), net_arch[-1]
 
 
 class SimBaSACPolicy(SACPolicy):
