@@ -1,15 +1,14 @@
 """The state of vectorised environments, with all that is in them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import NamedTuple
 
-import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor, VecVideoRecorder
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
 from sb3_cchain.checkpoint.object_state import ObjectStates
 from sb3_cchain.checkpoint.resumable_env import (
     RESUMED,
+    Parts,
     ResumableEnv,
     attempt,
     can_save_single_environment,
@@ -62,25 +61,7 @@ def can_save_environment(env: VecEnv) -> bool:
     return True
 
 
-class VecEnvParts(NamedTuple):
-    """
-    The objects of vectorised environments that have state in this process, as ``object_states()`` takes them.
-
-    :param holders: The vectorised environment, its wrappers, and the environments of a ``DummyVecEnv``, by names
-    :param known: What they refer to and is no state of theirs
-    :param skip: Attributes that are no state
-    :param strict: Names of the holders that must be saved whole
-    :param unused: Tasks that do nothing before their next reset
-    """
-
-    holders: dict[str, object]
-    known: dict[str, object]
-    skip: dict[str, Collection[str]]
-    strict: list[str]
-    unused: list[gym.Env]
-
-
-def vec_env_parts(env: VecEnv, prefix: str = "") -> VecEnvParts:
+def vec_env_parts(env: VecEnv, prefix: str = "") -> Parts:
     """
     :param env: A prepared environment
     :param prefix: What names begin with
@@ -91,15 +72,10 @@ def vec_env_parts(env: VecEnv, prefix: str = "") -> VecEnvParts:
     skip: dict[str, Collection[str]] = {
         name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()
     }
-    parts = VecEnvParts(dict(layers), _known(layers), skip, [], [])
+    parts = Parts(dict(layers), _known(layers), skip)
     if isinstance(env.unwrapped, DummyVecEnv):
         for position, single in enumerate(env.unwrapped.envs):
-            inner = environment_parts(single, f"{prefix}environment {position}, ")
-            parts.holders.update(inner.holders)
-            parts.known.update(inner.known)
-            parts.skip.update(inner.skip)
-            parts.strict.extend(inner.holders)
-            parts.unused.extend(inner.unused)
+            parts.add(environment_parts(single, f"{prefix}environment {position}, "))
     return parts
 
 

@@ -1,7 +1,8 @@
 """The state of a single environment with its wrappers."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType
@@ -54,7 +55,7 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         :return: The state of the environment and its wrappers, which can be pickled and does not change any more
         :raises ValueError: When the environment cannot be saved
         """
-        return single_environment_state(self)
+        return environment_parts(self).read()
 
     def load_state_dict(self, state: ObjectStates) -> None:
         """
@@ -63,7 +64,9 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         :param state: What ``state_dict()`` returned
         :raises ValueError: When the environment is another one
         """
-        restore_single_environment(self, state)
+        parts = environment_parts(self)
+        check_same_layers(parts.holders, state.holders)
+        restore_objects(parts.holders, state, parts.known)
 
     def resume_fault(self) -> str | None:
         """
@@ -162,7 +165,8 @@ def _may_have_begun(chain: Sequence[gym.Env]) -> bool:
 def describe_single_environment(env: gym.Env) -> str:
     """
     :param env: An environment
-    :return: Its id and the classes of its wrappers, from outside to inside; its own words may tell its state
+    :return: Its id and the classes of its wrappers, from outside to inside. Not ``str(env)``, which may tell of its
+        state
     """
     spec, names = env.spec, []
     while isinstance(env, gym.Wrapper):
@@ -180,23 +184,43 @@ def can_save_single_environment(env: gym.Env) -> bool:
     return all(layer.is_recorded for layer in _layers(env).values() if isinstance(layer, EpisodeReplay))
 
 
-class EnvironmentParts(NamedTuple):
+@dataclass
+class Parts:
     """
-    The objects of an environment that have state, as ``object_states()`` takes them.
+    Objects that have state, as ``object_states()`` takes them.
 
-    :param holders: The environment, its wrappers and, of a continual environment, all tasks, by names
-    :param known: What they refer to and is no state of theirs
-    :param skip: Attributes that are no state
+    :param holders: The objects by name: environments, their wrappers and, of a continual environment, all tasks
+    :param known: What they refer to and is not part of their state
+    :param skip: Attributes of each that are not part of its state
+    :param strict: Names of the holders that must be saved whole
     :param unused: Tasks that do nothing before their next reset
     """
 
     holders: dict[str, object]
     known: dict[str, object]
     skip: dict[str, Collection[str]]
-    unused: list[gym.Env]
+    strict: list[str] = field(default_factory=list)
+    unused: list[gym.Env] = field(default_factory=list)
+
+    def add(self, other: "Parts") -> None:
+        """
+        :param other: Objects that are saved together with these
+        """
+        for name in ("holders", "known", "skip"):
+            getattr(self, name).update(getattr(other, name))
+        self.strict += other.strict
+        self.unused += other.unused
+
+    def read(self, left_out: list[str] | None = None) -> ObjectStates:
+        """
+        :param left_out: See :func:`~sb3_cchain.checkpoint.object_state.object_states`
+        :return: Their states
+        """
+        with emptied(self.unused):
+            return object_states(self.holders, self.known, skip=self.skip, strict=self.strict, left_out=left_out)
 
 
-def environment_parts(env: gym.Env, prefix: str = "") -> EnvironmentParts:
+def environment_parts(env: gym.Env, prefix: str = "") -> Parts:
     """
     :param env: An environment that :func:`make_resumable` returned
     :param prefix: What names begin with
@@ -205,31 +229,7 @@ def environment_parts(env: gym.Env, prefix: str = "") -> EnvironmentParts:
     register_simulators()
     layers = _layers(env, prefix)
     skip: dict[str, Collection[str]] = {name: (*CONSTRUCTION, *_times(layer)) for name, layer in layers.items()}
-    return EnvironmentParts(dict(layers), _known(layers), skip, _tasks_not_under_way(layers))
-
-
-def single_environment_state(env: gym.Env) -> ObjectStates:
-    """
-    :param env: An environment that :func:`make_resumable` returned
-    :return: Its state and that of its wrappers
-    :raises ValueError: When the state cannot be saved
-    """
-    holders, known, skip, unused = environment_parts(env)
-    with emptied(unused):
-        return object_states(holders, known, skip=skip, strict=holders)
-
-
-def restore_single_environment(env: gym.Env, state: ObjectStates) -> None:
-    """
-    Put a state back.
-
-    :param env: An environment of the same kind, that :func:`make_resumable` returned and that was reset
-    :param state: What :func:`single_environment_state` returned
-    :raises ValueError: When the environment has other wrappers
-    """
-    holders, known, _, _ = environment_parts(env)
-    check_same_layers(holders, state.holders)
-    restore_objects(holders, state, known)
+    return Parts(dict(layers), _known(layers), skip, list(layers), _tasks_not_under_way(layers))
 
 
 def check_same_layers(layers: Iterable[str], saved_layers: Iterable[str]) -> None:

@@ -2,7 +2,7 @@
 
 import pickle
 import random
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,16 +17,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
 from sb3_cchain.checkpoint.environment_state import (
-    VecEnvParts,
     check_same_environment,
     env_layers,
     remote_states,
     restore_remotes,
     vec_env_parts,
 )
-from sb3_cchain.checkpoint.object_state import DATA, object_states, restore_objects
+from sb3_cchain.checkpoint.object_state import DATA, restore_objects
 from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
-from sb3_cchain.checkpoint.simulator_state import emptied
+from sb3_cchain.checkpoint.resumable_env import Parts
 from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
@@ -82,7 +81,7 @@ class TrainingParts(NamedTuple):
             known.update({f"{name} layer {number}": layer for number, layer in enumerate(env_layers(env))})
         return known
 
-    def env_parts(self) -> dict[str, VecEnvParts]:
+    def env_parts(self) -> dict[str, Parts]:
         """The objects of each environment that have state in this process."""
         return {name: vec_env_parts(env, f"{name} ") for name, env in self.envs.items()}
 
@@ -125,26 +124,19 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     :return: The state, which can be pickled, without what is in the model's own file; and the names of attributes that cannot
         be saved
     """
-    model, callbacks, known = parts.model, parts.callbacks, parts.known
+    model, callbacks = parts.model, parts.callbacks
     left_out: list[str] = []
-    envs = parts.env_parts() if with_envs else {}
-    skip: dict[str, Collection[str]] = {"model": _SKIPPED_OF_MODEL | _views(model)}
+    saved = Parts({"model": model, **callbacks}, parts.known, {"model": _SKIPPED_OF_MODEL | _views(model)})
     for name, callback in callbacks.items():
         # Callbacks keep the arguments with which the present process made them, such as the files that they write, but for
         # those that they change themselves
         before, now = parts.arguments[name], _arguments(callback)
         changed = {argument for argument in before.keys() & now.keys() if before[argument] != now[argument]}
-        skip[name] = _SKIPPED_OF_CALLBACK | (constructor_arguments(type(callback)) - changed)
-    holders: dict[str, object] = {"model": model, **callbacks}
-    strict: list[str] = []
+        saved.skip[name] = _SKIPPED_OF_CALLBACK | (constructor_arguments(type(callback)) - changed)
+    envs = parts.env_parts() if with_envs else {}
     for env in envs.values():
-        holders.update(env.holders)
-        known.update(env.known)
-        skip.update(env.skip)
-        strict += env.strict
-    # All in one, because callbacks and environments may refer to the same objects
-    with emptied([task for env in envs.values() for task in env.unused]):
-        objects = object_states(holders, known, skip=skip, strict=strict, left_out=left_out)
+        saved.add(env)
+    objects = saved.read(left_out)  # all at once, because callbacks and environments may refer to the same objects
     buffer = getattr(model, "replay_buffer", None)
     state: dict[str, Any] = {
         "objects": objects,
@@ -152,7 +144,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
         "gsde_noise": [
             {name: vars(noise)[name].detach() for name in _GSDE_NOISE if name in vars(noise)} for noise in _gsde(model)
         ],
-        "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, known),
+        "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, saved.known),
         "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
         "random": _random_state(model.device),
     }
@@ -186,23 +178,21 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
     :param model_path: The model's own file
     :param store: The big arrays
     """
-    model, known = parts.model, parts.known
-    saved_envs = state["envs"] or {}
+    model, saved_envs = parts.model, state["envs"] or {}
     envs = parts.env_parts() if saved_envs else {}
-    holders: dict[str, object] = {"model": model, **parts.callbacks}
+    found = Parts({"model": model, **parts.callbacks}, parts.known, {})
     for name, env in envs.items():
         saved_layers = [layer for layer in state["objects"].holders if layer.startswith(f"{name} ")]
         check_same_environment(parts.envs[name], env.holders, saved_envs[name][0], saved_layers)
-        holders.update(env.holders)
-        known.update(env.known)
+        found.add(env)
     _restore_parameters(model, model_path)
-    restore_objects(holders, state["objects"], known)
+    restore_objects(found.holders, state["objects"], found.known)
     for name in envs:
         restore_remotes(parts.envs[name], saved_envs[name][1])
     for noise, saved in zip(_gsde(model), state["gsde_noise"], strict=True):
         vars(noise).update(saved)
     if state["replay_buffer"] is not None:
-        restore_replay_buffer(model.replay_buffer, state["replay_buffer"], store, known)  # type: ignore[attr-defined]
+        restore_replay_buffer(model.replay_buffer, state["replay_buffer"], store, found.known)  # type: ignore[attr-defined]
     for name, values in state["logged"].items():
         vars(model.logger)[name].clear()
         vars(model.logger)[name].update(values)
