@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -105,8 +105,6 @@ class ContinualGymControl(ContinualEnv):
         else:
             self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
-        # What is missing to a task's own offset, by task. Added here, so that the tasks themselves stay as they are
-        self._missing_offsets: dict[int, NDArray[np.float32]] = {}
         super().__init__(
             tasks,
             steps_per_task,
@@ -127,28 +125,7 @@ class ContinualGymControl(ContinualEnv):
         :param weight: 0 for the offset of the task before, 1 for that of the present task
         """
         before, own = (self.offsets[task % len(self.offsets)] for task in (self.task_id - 1, self.task_id))
-        self._missing_offsets[self.task_id] = ((1 - weight) * (before - own)).astype(np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
-        """
-        :param seed: Seeds this and all later tasks
-        :param options: Passed on to the task
-        :return: Observation and info
-        """
-        observation, info = super().reset(seed=seed, options=options)
-        return self._drifting(observation), info
-
-    def step(self, action: Any) -> tuple[NDArray[Any], SupportsFloat, bool, bool, dict[str, Any]]:
-        """
-        :param action: The action
-        :return: Observation, reward, terminated, truncated, info
-        """
-        observation, reward, terminated, truncated, info = super().step(action)
-        return self._drifting(observation), reward, terminated, truncated, info
-
-    def _drifting(self, observation: NDArray[Any]) -> NDArray[Any]:
-        is_itself = not self.blend_steps or self._weights.get(self.task_id, 1.0) == 1
-        return observation if is_itself else observation + self._missing_offsets[self.task_id]
+        self.task.offset[...] = (1 - weight) * before + weight * own  # type: ignore[attr-defined]
 
 
 def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
