@@ -20,8 +20,8 @@ from sb3_cchain.algorithms.reference_batches import (
     ReferenceMinibatches,
     RolloutReferences,
 )
-from sb3_cchain.algorithms.reference_passes import joint_passes, separate_passes
-from sb3_cchain.churn import ChurnReducer, extra_gradient
+from sb3_cchain.algorithms.reference_passes import joint_passes
+from sb3_cchain.churn import ChurnReducer, component_backward, extra_gradient
 from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
@@ -29,7 +29,7 @@ from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly, has_convolutions
 from sb3_cchain.networks.policy_inputs import rows
-from sb3_cchain.networks.policy_outputs import has_training_mode, policy_values
+from sb3_cchain.networks.policy_outputs import has_training_mode
 from sb3_cchain.replaced import replaced
 from sb3_cchain.validation import check_choice, check_number
 
@@ -123,16 +123,17 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
     value_churns: list[float] = []
 
     def values_of(reference: Observations) -> th.Tensor:
-        return policy_values(policy, rows(reference, slice(VALUE_CHURN_SAMPLES)))
+        with th.no_grad():
+            return policy.predict_values(rows(reference, slice(VALUE_CHURN_SAMPLES)))
 
-    def hold_still(name: str) -> None:
+    def hold_still(name: str, backward: Callable[[th.Tensor], object] = th.Tensor.backward) -> None:
         reducer, target = reducers[name], targets[name]
         reference = references.reference(target.needs, name == "policy")
         if reference is None:
             reducer.forget_reference()
             return
         old = reducer.old_outputs
-        new = reducer.backward(reference)
+        new = reducer.backward(reference, backward)
         if name == "value" and new is not None:
             assert old is not None
             value_churns.append(mean_absolute_change(old, new.detach()))
@@ -148,12 +149,11 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
 
     with ExitStack() as stack:
         adders: dict[str, Callable[[], None]] = {name: partial(hold_still, name) for name in reducers}
-        if "policy" in reducers and isinstance(references, ReferenceBatches):
-            if _goes_jointly(policy, options):
-                passes = joint_passes(policy, reducers["policy"], references)
-            else:
-                passes = separate_passes(policy, reducers["policy"], references, options.churn_component)
-            adders["policy"] = stack.enter_context(passes)
+        if options.churn_component != "full":
+            backward = stack.enter_context(component_backward(list(policy.parameters()), options.churn_component))
+            adders["policy"] = partial(hold_still, "policy", backward)
+        elif "policy" in reducers and isinstance(references, ReferenceBatches) and _goes_jointly(policy, options):
+            adders["policy"] = stack.enter_context(joint_passes(policy, reducers["policy"], references))
         stack.enter_context(replaced(model.rollout_buffer, "get", references.get))
         surrogate = stack.enter_context(last_surrogate(model)) if options.churn_base_loss == "last" else None
         stack.enter_context(extra_gradient(policy.optimizer, lambda: before_update(adders)))

@@ -22,9 +22,6 @@ HELD_AT_MOST = 2**24
 class RolloutReferences(Protocol):
     """Stands in for ``rollout_buffer.get``, and has a reference batch for each minibatch of an epoch."""
 
-    # Whether the minibatch that is being trained on is the first of its epoch
-    starts_epoch: bool
-
     def get(self, batch_size: int | None = None) -> Iterator[Any]:
         """
         :param batch_size: Minibatch size
@@ -130,8 +127,6 @@ class ReferenceMinibatches:
     :param buffer: The rollout buffer
     """
 
-    starts_epoch: bool = False
-
     def __init__(self, buffer: RolloutBuffer):
         self._get = buffer.get
         self._sample: Any = None
@@ -144,7 +139,6 @@ class ReferenceMinibatches:
         minibatches = list(self._get(batch_size))
         for position, minibatch in enumerate(minibatches):
             self._sample = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)]
-            self.starts_epoch = position == 0
             yield minibatch
 
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> Any:
@@ -166,8 +160,6 @@ class PreviousRollout:
     :param buffer: The rollout buffer
     :param previous: Observations of the rollout before, if it is known
     """
-
-    starts_epoch: bool = False
 
     def __init__(self, buffer: RolloutBuffer, previous: PyTorchObs | None):
         self._get = buffer.get

@@ -1,14 +1,14 @@
 """How reference batches go through a PPO policy: by themselves, or together with the minibatches."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
-from sb3_cchain.churn import ChurnReducer, component_backward
+from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.churn.gradient import carrying
 from sb3_cchain.networks.joint_evaluation import evaluate_jointly
 from sb3_cchain.networks.policy_inputs import n_observations, rows
@@ -18,35 +18,12 @@ from sb3_cchain.replaced import replaced
 
 
 @contextmanager
-def separate_passes(
-    policy: ActorCriticPolicy, reducer: ChurnReducer, references: ReferenceBatches, component: str
-) -> Iterator[Callable[[], None]]:
-    """
-    Reference batches go through the policy by themselves, and the churn loss has a backward pass of its own.
-
-    :param policy: The policy
-    :param reducer: The reducer of its churn
-    :param references: Where its reference batches come from
-    :param component: Which component of the churn gradient is used
-    :return: What adds the churn gradient, to be called right after ``zero_grad()``
-    """
-    full = component == "full"
-    with nullcontext(th.Tensor.backward) if full else component_backward(list(policy.parameters()), component) as add_gradient:
-
-        def add() -> None:
-            assert references.current is not None
-            reducer.backward(references.current, add_gradient)
-
-        yield add
-
-
-@contextmanager
 def joint_passes(
     policy: ActorCriticPolicy, reducer: ChurnReducer, references: ReferenceBatches
 ) -> Iterator[Callable[[], None]]:
     """
-    The reference batch whose churn loss is due goes through the actor together with the minibatch, and what PPO evaluates of
-    the minibatch carries the churn loss, so that one backward pass serves both losses.
+    The reference batch whose churn loss is due goes through the actor together with the minibatch, and the churn loss is
+    attached to what PPO computes for the minibatch, so that one backward pass serves both losses.
 
     :param policy: A policy, of which ``can_evaluate_jointly()`` is true
     :param reducer: The reducer of its churn

@@ -129,16 +129,6 @@ def _stack_padded(sub_actions: Sequence[th.Tensor]) -> th.Tensor:
     return th.stack([F.pad(probs, (0, width - probs.shape[1])) for probs in sub_actions], dim=1)
 
 
-def policy_values(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
-    """
-    :param policy: An actor-critic policy
-    :param observations: Batch of observations
-    :return: State values ``(batch_size, 1)``, without gradient
-    """
-    with th.no_grad():
-        return policy.predict_values(observations)
-
-
 def has_training_mode(policy: nn.Module) -> bool:
     """
     :param policy: A policy
