@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import TRPO
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
@@ -15,6 +16,10 @@ from tests.envs import CountEnv, RandomEnv
 from tests.method_models import make_model
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
+
+
+class OwnTrustRegion(TRPO):
+    """A user's subclass."""
 
 
 class InTrain(BaseCallback):
@@ -155,6 +160,7 @@ def test_the_loss_of_c_chain_has_the_raised_bonus():
         (ExplorationRateRestart, lambda: make_model("PPO", CountEnv()), "ExplorationRateRestart is for DQN, got PPO"),
         (LogStdRestart, lambda: make_model("PPO", CountEnv()), r"Box actions, got PPO with Discrete\(2\)"),
         (EntropyBonusRestart, lambda: SAC("MlpPolicy", "Pendulum-v1"), "EntropyBonusRestart is for PPO and A2C, got SAC"),
+        (EntropyBonusRestart, lambda: OwnTrustRegion("MlpPolicy", "CartPole-v1"), "PPO and A2C, got OwnTrustRegion"),
     ],
 )
 def test_other_algorithms_are_refused(make, model, message):

@@ -1,11 +1,9 @@
 """C-CHAIN for a stock model, for instance one that the stock ``rl_zoo3`` command trains."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import Any
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EventCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -14,9 +12,10 @@ from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
-from sb3_cchain.callbacks.replaced_methods import wrapped
+from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.lean_distributions import make_lean
+from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
@@ -25,8 +24,9 @@ from sb3_cchain.validation import check_bool
 
 class CChainCallback(FiniteCheck):
     """
-    Trains a stock model of SB3 or sb3-contrib as the algorithm of this package trains that has its name, such as
-    :class:`~sb3_cchain.algorithms.CChainPPO`, for instance from the YAML file of the stock ``rl_zoo3``::
+    Reduces churn in a stock model of SB3 or sb3-contrib as the algorithm of this package with its name does, such as
+    :class:`~sb3_cchain.algorithms.CChainPPO`; DQN stays DQN, where ``CChainDQN`` is Double DQN by default. For instance from
+    the YAML file of the stock ``rl_zoo3``::
 
         callback:
           - sb3_cchain.CChainCallback:
@@ -86,8 +86,8 @@ class CChainCallback(FiniteCheck):
         self.lean = lean
         self.reset_churn_coef = reset_churn_coef
         self._task_switch = TaskSwitch()
-        # The methods of the model that are replaced from the end of a rollout to train()
-        self._replaced = ExitStack()
+        # On the model from the end of a rollout to train()
+        self._hooks = TrainingHooks()
 
     @property
     def churn_reducer(self) -> ChurnReducer:
@@ -111,7 +111,7 @@ class CChainCallback(FiniteCheck):
 
     def _check_options(self, algorithm: str, targets: tuple[str, ...]) -> None:
         default = PolicyChurnOptions()
-        has_ppos_references = isinstance(self.model, PPO) or _is_trpo(self.model)
+        has_ppos_references = isinstance(self.model, PPO) or is_trpo(self.model)
         holds_ppos_policy = isinstance(self.model, PPO) and targets == ("policy",)
         is_last = self._options.churn_base_loss == "last"
         for argument, is_known in (
@@ -132,11 +132,9 @@ class CChainCallback(FiniteCheck):
             )
 
     def _on_training_start(self) -> None:
-        self._replaced.close()  # what training that was interrupted left, maybe on another model
+        self._hooks.begin(self.model)
         self._check_parent()  # again: SB3 initialises the callbacks in a list before it tells them their parent
         require_single(self)  # two would add the churn loss twice
-        # Tells this call of learn() from others
-        self._start_time = self.model.start_time
 
     def _on_step(self) -> bool:
         super()._on_step()
@@ -147,28 +145,17 @@ class CChainCallback(FiniteCheck):
 
     def _on_rollout_end(self) -> None:
         super()._on_rollout_end()
-        # Off-policy, train() does not follow on each rollout
-        self._replaced.close()
-        if not self.churn_reducers.active():
-            return
-        # Innermost, so that L is computed with what other callbacks set for train()
-        self._replaced.enter_context(wrapped(self.model, "train", self._train_once, innermost=True))
+        self._hooks.remove()  # off-policy, train() does not follow on each rollout
+        if self.churn_reducers.active():
+            # Innermost, so that L is computed with what other callbacks set for train()
+            self._hooks.around_call(self.model, "train", self._train, innermost=True)
 
-    def _train_once(self, train: Callable[[], None]) -> None:
-        self._replaced.close()  # first, so that nothing is left when train() fails, too
-        if self.model.start_time != self._start_time:
-            # Left from a learn() that was interrupted between the end of a rollout and train()
-            train()
-            return
+    def _train(self, train: Callable[[], None]) -> None:
+        self._hooks.remove()  # first, so that nothing is left when train() fails, too
         with reduced_churn(self.model, self.churn_reducers, self._options):
             train()
         self._state.n_updates = self.model._n_updates
 
     def _on_training_end(self) -> None:
-        self._replaced.close()
+        self._hooks.remove()
         super()._on_training_end()
-
-
-def _is_trpo(model: BaseAlgorithm) -> bool:
-    # By its name, as sb3-contrib need not be installed
-    return any(base.__name__ == "TRPO" for base in type(model).__mro__)

@@ -16,7 +16,7 @@ from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.networks.batch_outputs import Batch
-from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.networks.model_optimizers import is_trpo, model_optimizers
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 
@@ -169,8 +169,7 @@ def _leading_optimizer(model: BaseAlgorithm) -> th.optim.Optimizer | None:
     :return: The optimiser whose steps begin the updates: the critic's, when actor and critic have separate ones. None when the
         optimiser, if any, does not make all of the changes.
     """
-    # By its name, as sb3-contrib need not be installed
-    if any(base.__name__ == "TRPO" for base in type(model).__mro__):
+    if is_trpo(model):
         return None
     optimizers = model_optimizers(model)
     return optimizers.get("critic", optimizers.get(""))

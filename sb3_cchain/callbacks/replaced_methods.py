@@ -3,12 +3,14 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 # Is given a function that calls the method, and returns what the method is to return
 Wrapper = Callable[[Callable[[], Any]], Any]
+
+_NOT_SAVED = "_excluded_save_params"
 
 
 class _StandIn:
@@ -16,15 +18,7 @@ class _StandIn:
 
     def __init__(self, owner: object, method: str):
         self.method: Callable[..., Any] = getattr(owner, method)
-        self.own_method = vars(owner).get(method)  # that the user gave to this object
-
-    def call(self, *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError
-
-
-class _Wrapped(_StandIn):
-    def __init__(self, owner: object, method: str):
-        super().__init__(owner, method)
+        self.own_method = vars(owner).get(method)  # set by the user on this object
         self.wrappers: list[Wrapper] = []
 
     def call(self, *args: Any, **kwargs: Any) -> Any:
@@ -32,18 +26,6 @@ class _Wrapped(_StandIn):
         for wrapper in self.wrappers:
             call = partial(wrapper, call)
         return call()
-
-
-class _ExcludedSaveParams(_StandIn):
-    def __init__(self, owner: object, method: str):
-        super().__init__(owner, method)
-        self.names: list[str] = []
-
-    def call(self, *args: Any, **kwargs: Any) -> list[str]:
-        return [*self.method(), *self.names, "_excluded_save_params"]
-
-
-AnyStandIn = TypeVar("AnyStandIn", bound=_StandIn)
 
 
 @contextmanager
@@ -54,49 +36,27 @@ def wrapped(owner: object, method: str, wrapper: Wrapper, innermost: bool = Fals
     :param wrapper: Called in place of the method inside the ``with`` block
     :param innermost: Whether it calls the method itself, and not the wrappers that are there already
     """
-    stand_in = _stand_in(owner, method, _Wrapped)
+    stand_in = _present(owner, method)
+    if stand_in is None:
+        stand_in = _StandIn(owner, method)
+        setattr(owner, method, stand_in.call)
     stand_in.wrappers.insert(0 if innermost else len(stand_in.wrappers), wrapper)
     try:
-        with not_saved(owner, method) if isinstance(owner, BaseAlgorithm) else nullcontext():
+        with _not_saved(owner, method) if isinstance(owner, BaseAlgorithm) and method != _NOT_SAVED else nullcontext():
             yield
     finally:
         stand_in.wrappers.remove(wrapper)
-        if not stand_in.wrappers:
-            _put_back(owner, method, stand_in)
+        if not stand_in.wrappers and _present(owner, method) is stand_in:  # else the user put something else there
+            delattr(owner, method)
+            if stand_in.own_method is not None:
+                setattr(owner, method, stand_in.own_method)
 
 
-@contextmanager
-def not_saved(model: BaseAlgorithm, name: str) -> Iterator[None]:
-    """
-    :param model: A model, all attributes of which Stable-Baselines3 saves
-    :param name: An attribute that is not saved inside the ``with`` block
-    """
-    stand_in = _stand_in(model, "_excluded_save_params", _ExcludedSaveParams)
-    stand_in.names.append(name)
-    try:
-        yield
-    finally:
-        stand_in.names.remove(name)
-        if not stand_in.names:
-            _put_back(model, "_excluded_save_params", stand_in)
+def _not_saved(model: BaseAlgorithm, name: str) -> Any:
+    """SB3 saves all attributes of a model but those that this method names."""
+    return wrapped(model, _NOT_SAVED, lambda names: [*names(), name, _NOT_SAVED])
 
 
-def _stand_in(owner: object, method: str, kind: type[AnyStandIn]) -> AnyStandIn:
-    present = _present(owner, method)
-    if isinstance(present, kind):
-        return present
-    made = kind(owner, method)
-    setattr(owner, method, made.call)
-    return made
-
-
-def _put_back(owner: object, method: str, stand_in: _StandIn) -> None:
-    if _present(owner, method) is not stand_in:
-        return  # the user has put something else in its place, which may call it
-    delattr(owner, method)
-    if stand_in.own_method is not None:
-        setattr(owner, method, stand_in.own_method)
-
-
-def _present(owner: object, method: str) -> Any:
-    return getattr(vars(owner).get(method), "__self__", None)
+def _present(owner: object, method: str) -> _StandIn | None:
+    found = getattr(vars(owner).get(method), "__self__", None)
+    return found if isinstance(found, _StandIn) else None

@@ -76,7 +76,7 @@ class TrainingHooks:
 
         self.around_call(owner, method, call_both)
 
-    def around_call(self, owner: object, method: str, function: Wrapper) -> None:
+    def around_call(self, owner: object, method: str, function: Wrapper, innermost: bool = False) -> None:
         """
         :param owner: The model, or an object that it uses
         :param method: Name of one of its methods
@@ -89,7 +89,7 @@ class TrainingHooks:
                 return call()
             return function(call)
 
-        self._attached.enter_context(wrapped(owner, method, call_around))
+        self._attached.enter_context(wrapped(owner, method, call_around, innermost))
 
     def _is_over(self) -> bool:
         # SB3 sets the start time at the beginning of each `learn()`

@@ -10,6 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import churn_reducers
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.validation import check_number
@@ -129,7 +130,7 @@ class EntropyBonusRestart(TaskBoundary):
 
     def _init_callback(self) -> None:
         # TRPO has the argument of its base class and does not use it
-        if not isinstance(self.model, OnPolicyAlgorithm) or type(self.model).__name__.endswith("TRPO"):
+        if not isinstance(self.model, OnPolicyAlgorithm) or is_trpo(self.model):
             raise TypeError(f"EntropyBonusRestart is for PPO and A2C, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
