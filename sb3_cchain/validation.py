@@ -15,6 +15,7 @@ def check_number(
     maximum: float = math.inf,
     exclusive: bool = False,
     integer: bool = False,
+    below: float = math.inf,
 ) -> None:
     """
     :param name: The argument's name
@@ -23,6 +24,7 @@ def check_number(
     :param maximum: The greatest value allowed
     :param exclusive: Whether ``minimum`` itself is forbidden
     :param integer: Whether the value must be an integer
+    :param below: What it must be less than
     :raises ValueError: When it is not a finite number in that range
     """
     kind = Integral if integer else Real
@@ -32,13 +34,17 @@ def check_number(
         and math.isfinite(value)
         and minimum <= value <= maximum  # type: ignore[operator]
         and not (exclusive and value == minimum)
+        and value < below
     ):
         return
     expected = "an integer" if integer else "a number"
-    if math.isfinite(maximum):
-        expected += f" between {minimum:g} and {maximum:g}"
+    lower = f"greater than {minimum:g}" if exclusive else f"greater than or equal to {minimum:g}"
+    if math.isfinite(below):
+        expected += f" {lower} and less than {below:g}"
+    elif math.isfinite(maximum):
+        expected += f" {lower} and at most {maximum:g}" if exclusive else f" between {minimum:g} and {maximum:g}"
     elif math.isfinite(minimum):
-        expected += f" greater than {minimum:g}" if exclusive else f" greater than or equal to {minimum:g}"
+        expected += f" {lower}"
     raise ValueError(f"`{name}` must be {expected}, got {value!r}")
 
 

@@ -80,9 +80,7 @@ class ContinualBackprop(UnitRecycling):
         super().__init__()
         check_number("replacement_rate", replacement_rate, 0, 1)
         check_number("maturity_threshold", maturity_threshold, 0, integer=True)
-        check_number("decay_rate", decay_rate, 0, 1)
-        if decay_rate == 1:
-            raise ValueError("`decay_rate` must be below 1, got 1")
+        check_number("decay_rate", decay_rate, 0, below=1)
         check_choice("utility", utility, UTILITIES)
         check_number("batch_size", batch_size, 1, integer=True)
         self.replacement_rate = replacement_rate

@@ -57,9 +57,7 @@ class Kron(OptimizerWrapper):
         update_probability: float | None = None,
         max_size_triangular: int = 8192,
     ):
-        check_number("momentum", momentum, minimum=0, maximum=1)
-        if momentum == 1:
-            raise ValueError("`momentum` must be less than 1, got 1")
+        check_number("momentum", momentum, minimum=0, below=1)
         check_number("weight_decay", weight_decay, minimum=0)
         if update_probability is not None:
             check_number("update_probability", update_probability, minimum=0, maximum=1)

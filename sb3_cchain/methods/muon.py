@@ -69,9 +69,7 @@ class Muon(OptimizerWrapper):
     ):
         check_number("n_output_layers", n_output_layers, minimum=0, integer=True)
         check_number("lr_factor", lr_factor, minimum=0)
-        check_number("momentum", momentum, minimum=0, maximum=1)
-        if momentum == 1:
-            raise ValueError("`momentum` must be less than 1, got 1")
+        check_number("momentum", momentum, minimum=0, below=1)
         check_bool("nesterov", nesterov)
         check_number("weight_decay", weight_decay, minimum=0)
         self.n_output_layers = n_output_layers

@@ -24,7 +24,8 @@ class PlasticityInjection(TaskBoundary):
     :math:`\theta'_2` are frozen, and :math:`\theta'_1` is trained, which is as many parameters as before.
 
     Paper: "Deep reinforcement learning with plasticity injection", https://arxiv.org/abs/2305.15555 (Nikishin et al., NeurIPS
-    2023). What the features extractor computes is the input :math:`x` of the head, and it is trained on.
+    2023). What the features extractor computes is the input :math:`x` of the head, and the extractor goes on
+    being trained.
 
     The policy must be :class:`~sb3_cchain.networks.InjectionPolicy` (PPO, A2C) or
     :class:`~sb3_cchain.networks.InjectionDQNPolicy`, which has the parameters in its optimiser from the beginning. Those of

@@ -79,7 +79,7 @@ class ShrinkAndPerturb(TaskBoundary):
             super()._on_rollout_start()
 
     def _on_step(self) -> bool:
-        return super()._on_step() if self.interval is None else True
+        return self.interval is not None or super()._on_step()
 
     def _on_task_switch(self) -> None:
         self._shrink_and_perturb()

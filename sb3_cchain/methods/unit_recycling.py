@@ -83,8 +83,9 @@ class IntervalRecycling(UnitRecycling, TrainingInterval):
     trained on; DQN with a sample of the replay buffer. C-CHAIN then forgets its reference batch, so that churn reduction does
     not undo the recycling.
 
-    Logged: ``<name>/n_recycled``, the units recycled since ``learn()`` was called; ``<name>/dormant_share``, the share of them
-    the last time, and ``<name>/dormant_share/<layer>`` of each layer (not in the table on the screen).
+    Logged: ``<name>/n_recycled``, the units recycled since ``learn()`` was called; ``<name>/dormant_share``, the share
+    of all units that was recycled the last time, and ``<name>/dormant_share/<layer>``, that of each layer (not in the table on
+    the screen).
 
     :param interval: As for ``TrainingInterval``
     :param batch_size: Observations to look at

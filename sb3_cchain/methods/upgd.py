@@ -67,9 +67,7 @@ class UPGD(OptimizerWrapper):
         **kwargs: Any,
     ):
         check_number("sigma", sigma, minimum=0)
-        check_number("beta", beta, minimum=0, maximum=1)
-        if beta == 1:
-            raise ValueError("`beta` must be less than 1, got 1")
+        check_number("beta", beta, minimum=0, below=1)
         check_number("weight_decay", weight_decay, minimum=0)
         self.sigma = sigma
         self.beta = beta

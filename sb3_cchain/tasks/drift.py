@@ -17,7 +17,7 @@ class Drift:
     After an alarm it starts over.
 
     :param detector: ``"adwin"``
-    :param delta: δ of ADWIN, between 0 and 1
+    :param delta: δ of ADWIN, greater than 0 and less than 1
     :param worse: Which values are worse: ``"smaller"`` or ``"greater"`` ones. A change to better values is not told
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When ``river`` is not installed
@@ -25,7 +25,7 @@ class Drift:
 
     def __init__(self, detector: str = "adwin", delta: float = 0.002, worse: str = "smaller"):
         check_choice("drift", detector, DETECTORS)
-        check_number("drift_delta", delta, 0, 1, exclusive=True)
+        check_number("drift_delta", delta, 0, exclusive=True, below=1)
         check_choice("worse", worse, DIRECTIONS)
         self.delta = delta
         self.worse = worse
