@@ -34,7 +34,7 @@ def open_locked(path: Path, message: str) -> TextIO:
     not closed it.
 
     :param path: The file; it is made if it does not exist
-    :param message: Of the error
+    :param message: What the error says when another process has it
     :return: The file
     :raises ValueError: When another process has it
     """

@@ -24,7 +24,7 @@ class ChurnState:
         self.model = model
         self.reducers = reducers
         self.task_switch = task_switch
-        # `model._n_updates` after the last training with churn reduction; None when there is no other training
+        # `model._n_updates` after the last training with churn reduction; None for models that always train with it
         self.n_updates: int | None = None
 
     @property

@@ -39,8 +39,8 @@ class Doctor(TrainingInterval):
 
     It looks at the first rollout that the model learns from, and then at each in which a multiple of ``interval`` was reached:
     at the data before ``train()``, at the gradients in it, and at the networks after it. A finding that holds at ``patience``
-    looks in a row is a ``UserWarning``, once in a training; parameters that are not finite are one at once. It is not given
-    again after the training was resumed.
+    looks in a row is a ``UserWarning``, once in a training; NaN or infinite parameters are warned of at once. A warning is not
+    given again after the training was resumed.
 
     Logged at each look: ``doctor/n_findings``, how many findings there are, and of each measure the worst one of all parts of
     the network, as ``doctor/<measure>`` (not in the table on the screen).

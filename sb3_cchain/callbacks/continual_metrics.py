@@ -57,7 +57,7 @@ class ContinualMetrics(BaseCallback):
     :class:`~sb3_cchain.TaskSignal` before this callback. Without one, each further environment that ``set_env()`` gives,
     followed by ``learn(..., reset_num_timesteps=False)``, is the next task.
 
-    ``CChainPPO`` and ``CChainDQN`` add the callback by themselves in a continual environment, and where there is a
+    The algorithms with churn reduction add the callback by themselves in a continual environment, and where there is a
     ``TaskSignal``. Give it to other algorithms.
 
     :param path: The CSV file; by default ``returns.csv`` in the folder of the logs, if the model has ``tensorboard_log``

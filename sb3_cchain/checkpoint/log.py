@@ -22,7 +22,7 @@ _FORMATS = {CSVOutputFormat: "csv", JSONOutputFormat: "json", TensorBoardOutputF
 def describe_log(model: BaseAlgorithm) -> dict[str, Any]:
     """
     :param model: A model in ``learn()``
-    :return: The folder of its logger, None when a loaded model has the same logger by itself; the ``formats`` of
+    :return: The folder of its logger, None when the logger has none that lasts; the ``formats`` of
         Stable-Baselines3 that it writes; and the classes of ``others``
     """
     formats, others = [], []

@@ -17,7 +17,8 @@ LOSS_EPS = 1e-8
 
 class ChurnCoefficient(nn.Module):
     """
-    A fixed λ. Also the interface of every λ: ``value``, ``update(base_loss, churn_loss)``, ``reset()``.
+    A fixed λ. Also the interface of every λ: ``value``, ``is_zero``, ``update(base_loss, churn_loss)``, ``reset()`` and
+    ``problem()``.
 
     :param initial: λ; 0 switches churn reduction off
     :raises ValueError: When it is negative, NaN, infinite or beyond single precision
@@ -142,9 +143,8 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
 
     def problem(self) -> str | None:
         """
-        Looked for at the end of each window.
-
-        :return: Why λ cannot hold the ratio of the losses over that window; None where it can
+        :return: Right after a window has ended, why λ cannot hold the ratio of the losses over it; None where it can, and at
+            other times
         """
         n_seen, window = int(self.n_seen), len(self.base_losses)
         if n_seen % window or n_seen < self.warmup or not n_seen:

@@ -24,8 +24,8 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
     touched the rewards.
 
     With several environments side by side steps are counted over all of them, so that they switch together:
-    :class:`~sb3_cchain.TaskSync` tells them their number (``CChainPPO`` and ``CChainDQN`` add it by themselves); without it,
-    pass ``n_envs``.
+    :class:`~sb3_cchain.TaskSync` tells them their number (the algorithms with churn reduction add it by themselves); without
+    it, pass ``n_envs``.
 
     :param tasks: Environment ids, or callables that make an environment; they must agree in their spaces. A callable is
         given ``render_mode=...`` if and only if one is asked for.

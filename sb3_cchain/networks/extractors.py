@@ -84,7 +84,7 @@ class ImpalaCNN(_ImageExtractor):
     """
     The residual network of IMPALA (https://arxiv.org/abs/1802.01561, Figure 3, without its LSTM): three blocks, each of a 3×3
     convolution, a 3×3 max-pooling that halves height and width, and two residual blocks; then ReLU, a linear layer and ReLU.
-    The weights have Xavier's initialisation (uniform, gain 1) and the biases with zero, as in the C-CHAIN paper.
+    The weights have Xavier's initialisation (uniform, gain 1) and the biases are zero, as in the C-CHAIN paper.
 
     Give it as ``features_extractor_class`` to any policy, with ``net_arch=[]`` to have nothing between the features and the
     outputs. For PPO and A2C take :class:`~sb3_cchain.networks.ImpalaPolicy`: their policies initialise the features

@@ -59,7 +59,7 @@ class TaskClock:
     @property
     def is_over(self) -> bool:
         """Whether the present task's time is over. It never is when the clock is pinned to a task."""
-        return self._pinned_task is None and bisect_right(self._ends, self._total_steps) != self.task_id
+        return not self.is_pinned and self.due_task != self.task_id
 
     def set(self, total_steps: int, n_envs: int | None = None) -> None:
         """

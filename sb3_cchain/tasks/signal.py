@@ -56,7 +56,8 @@ def step_task(model: BaseAlgorithm, infos: list[dict[str, Any]]) -> Any:
 def episode_task(model: BaseAlgorithm) -> Any:
     """
     :param model: A model during ``learn()``
-    :return: The task that the next step will be made in. It tells of a switch at once: where the environment numbers its
+    :return: The task that the next step will be made in. Where an environment without numbered tasks is another one than
+        before, this counts it as a further task. It tells of a switch at once: where the environment numbers its
         tasks, the step that ends a task ends an episode, and the vectorised environment has already begun the next one.
     """
     assert model.env is not None

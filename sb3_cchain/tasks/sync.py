@@ -20,8 +20,8 @@ class TaskSync(BaseCallback):
     - The environments of every ``EvalCallback`` given to ``learn()`` are put on the task being trained. Otherwise they would
       count their own few steps and stay on the first task.
 
-    ``CChainPPO`` and ``CChainDQN`` add it by themselves in a continual environment. Give it to other algorithms, before any
-    ``EvalCallback``.
+    The algorithms with churn reduction add it by themselves in a continual environment. Give it to other algorithms, before
+    any ``EvalCallback``.
 
     It raises a ``TypeError`` when the training environment is not continual, and a ``ValueError`` when environments side by
     side do not have the same tasks at the same times, or an evaluation environment has other tasks than they.

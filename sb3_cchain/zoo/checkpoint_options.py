@@ -103,10 +103,10 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
     others.add_argument("-i", "--trained-agent", default="")
     others.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
     other, _ = others.parse_known_args(rest)
-    for name, least in (("checkpoint_freq", 1), ("checkpoint_keep", 1)):
+    for name in ("checkpoint_freq", "checkpoint_keep"):
         value = getattr(given, name)
-        if value is not None and value < least:
-            sys.exit(f"--{name.replace('_', '-')} must be at least {least}; got {value}")
+        if value is not None and value < 1:
+            sys.exit(f"--{name.replace('_', '-')} must be at least 1; got {value}")
     if given.checkpoint_freq is None and given.resume is None:
         sys.exit("--checkpoint-keep says how many checkpoints stay: give --checkpoint-freq STEPS, too")
     if other.optimize_hyperparameters:
@@ -176,7 +176,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ValueError(
             f"the checkpoints in {folder} were not made by `sb3-cchain train`, which writes {COMMAND} beside them: go on in "
-            "Python, by sb3_cchain.checkpoint.resume()"
+            "Python, by sb3_cchain.resume()"
         ) from None
 
 
