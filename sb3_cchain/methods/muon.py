@@ -85,8 +85,7 @@ class Muon(OptimizerWrapper):
         """
         :return: The parameters that Muon updates
         """
-        weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
-        hidden = weights[: len(weights) - self.n_output_layers]
+        hidden = self.weights(self.n_output_layers)
         return [weight for weight in hidden if weight.dim() == 2 and len(weight) > 1]
 
     def _step(self) -> None:

@@ -64,23 +64,19 @@ class NormalizeAndProject(OptimizerWrapper):
         self.n_output_layers = n_output_layers
         self.interval = interval
         super().__init__(params, lr, **kwargs)
-        if not self._weights():
+        if not self.weights(self.n_output_layers):
             raise ValueError(f"`n_output_layers` must leave a weight matrix to project, got {n_output_layers!r}")
-
-    def _weights(self) -> list[th.Tensor]:
-        weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
-        return weights[: len(weights) - self.n_output_layers]
 
     def _step(self) -> None:
         if "initial_norms" not in self.own_state:
-            self.own_state["initial_norms"] = _norms(self._weights())
+            self.own_state["initial_norms"] = _norms(self.weights(self.n_output_layers))
         super()._step()
         self.own_state["n_updates"] = self.own_state.get("n_updates", 0) + 1
         if self.own_state["n_updates"] % self.interval == 0:
             self._project()
 
     def _project(self) -> None:
-        weights = self._weights()
+        weights = self.weights(self.n_output_layers)
         norms = _norms(weights)
         initial = self.own_state["initial_norms"].to(norms.device)
         for weight, factor in zip(weights, th.where(norms > 0, initial / norms, 1.0), strict=True):

@@ -91,6 +91,14 @@ class OptimizerWrapper(th.optim.Optimizer):
         """
         return [parameter for group in self.param_groups for parameter in group["params"]]
 
+    def weights(self, n_output_layers: int = 0) -> list[th.Tensor]:
+        """
+        :param n_output_layers: Number of weights at the end that are left out
+        :return: The parameters that are weight matrices, or of convolutions, in order
+        """
+        weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
+        return weights[: len(weights) - n_output_layers]
+
     def reference(self) -> list[th.Tensor]:
         """
         :return: A copy of each parameter, made when this was first called, or first called with that parameter. SB3 makes

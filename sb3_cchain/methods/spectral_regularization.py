@@ -47,12 +47,9 @@ class SpectralRegularization(Penalty):
         self.power = power
         super().__init__(params, lr, coef=coef, **kwargs)
 
-    def _weights(self) -> list[th.Tensor]:
-        return [parameter for parameter in self.parameters() if parameter.dim() > 1]
-
     def _singular(self, n_iterations: int = 1) -> list[tuple[th.Tensor, th.Tensor, th.Tensor]]:
         """Of each weight matrix the greatest singular value, its left and its right vector."""
-        matrices = [weight.flatten(start_dim=1) for weight in self._weights()]
+        matrices = [weight.flatten(start_dim=1) for weight in self.weights()]
         known = self.own_state.get("vectors", [])
         if len(known) < len(matrices):
             n_iterations = 15
@@ -83,5 +80,5 @@ class SpectralRegularization(Penalty):
         self.own_state["vectors"] = [left for _, left, _ in singular]
         return [
             (weight, (2 * k * (sigma**k - 1) * sigma ** (k - 1) * left.outer(right)).view_as(weight))
-            for weight, (sigma, left, right) in zip(self._weights(), singular, strict=True)
+            for weight, (sigma, left, right) in zip(self.weights(), singular, strict=True)
         ]
