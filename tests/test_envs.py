@@ -382,6 +382,13 @@ class HasTaskId(RandomEnv):
     steps_per_task = 5
 
 
+def test_an_evaluation_callback_needs_an_environment_of_its_own():
+    env = make_vec_env("Continual/CartPole-v1", env_kwargs=dict(n_tasks=2, steps_per_task=64))
+    for same in (env, DummyVecEnv([lambda: env.envs[0]])):
+        with pytest.raises(ValueError, match="must have an environment of its own"):
+            CChainPPO("MlpPolicy", env, n_steps=32, batch_size=32).learn(128, EvalCallback(same, eval_freq=32))
+
+
 def test_environments_that_are_not_continual():
     CChainPPO("MlpPolicy", HasTaskId(), **SETTINGS).learn(16)
     with pytest.raises(TypeError, match="TaskSync is for continual environments"):

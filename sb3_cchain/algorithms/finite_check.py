@@ -32,13 +32,14 @@ class FiniteCheck(BaseCallback):
             self._check_observations(self.model._last_obs)
 
     def _on_step(self) -> bool:
-        rewards, observations = self.locals["rewards"], self.locals["new_obs"]
+        # An algorithm of one's own may have other names, or lists
+        rewards, observations = np.asarray(self.locals.get("rewards", 0)), self.locals.get("new_obs", ())
         if not _surely_finite(rewards):
             self._check("reward", rewards)
-        if isinstance(observations, dict) or not _surely_finite(observations):
+        if isinstance(observations, dict) or not _surely_finite(np.asarray(observations)):
             self._check_observations(observations)
-        if any(self.locals["dones"].tolist()):
-            for index, info in enumerate(self.locals["infos"]):
+        if any(np.asarray(self.locals.get("dones", ())).tolist()):
+            for index, info in enumerate(self.locals.get("infos", ())):
                 if "terminal_observation" in info:
                     self._check_observations(info["terminal_observation"], index)
         return True

@@ -55,7 +55,9 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._reset_arguments = {"seed": seed, "options": deepcopy(options)}
         self._actions = []
         self.is_recorded = True
-        observation, info = self.env.reset(seed=seed, options=options)
+        # As SB3 does, for environments whose `reset()` takes no options
+        given = {} if options is None else {"options": options}
+        observation, info = self.env.reset(seed=seed, **given)
         self._observation = observation
         return observation, info
 

@@ -48,7 +48,9 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         if options is not None and RESUMED in options:
             return None, options[RESUMED]  # type: ignore[return-value]
-        return self.env.reset(seed=seed, options=options)
+        # As SB3 does, for environments whose `reset()` takes no options
+        given = {} if options is None else {"options": options}
+        return self.env.reset(seed=seed, **given)
 
     def state_dict(self) -> ObjectStates:
         """

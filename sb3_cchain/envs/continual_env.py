@@ -153,7 +153,9 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
             seed = int(self.np_random.integers(2**31))
         if self.blend_steps:
             self._drift()
-        observation, info = self.task.reset(seed=seed, options=options)
+        # As SB3 does, for tasks whose `reset()` takes no options
+        given = {} if options is None else {"options": options}
+        observation, info = self.task.reset(seed=seed, **given)
         self._episode_return = 0.0
         return observation, {**info, "task_id": self.task_id}
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.signal import is_continual
@@ -28,6 +28,24 @@ def evaluate_on(task_id: int, eval_envs: Sequence[VecEnv]) -> None:
     """
     for eval_env in eval_envs:
         eval_env.env_method("set_task", task_id)
+
+
+def check_apart(env: VecEnv, eval_env: VecEnv) -> None:
+    """
+    :param env: The training environment
+    :param eval_env: An evaluation environment
+    :raises ValueError: When both are the same
+    """
+    if {id(each) for each in _innermost(env)} & {id(each) for each in _innermost(eval_env)}:
+        raise ValueError(
+            "An EvalCallback must have an environment of its own, because it keeps that on the task being trained. Got the "
+            "training environment, whose tasks would not switch any more."
+        )
+
+
+def _innermost(env: VecEnv) -> list[object]:
+    inner = env.unwrapped
+    return [single.unwrapped for single in inner.envs] if isinstance(inner, DummyVecEnv) else [inner]
 
 
 def check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:

@@ -7,7 +7,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
-from sb3_cchain.tasks.evaluation import check_same_tasks, evaluate_on, find_eval_envs
+from sb3_cchain.tasks.evaluation import check_apart, check_same_tasks, evaluate_on, find_eval_envs
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info, is_continual, require_continual
 
 
@@ -24,7 +24,8 @@ class TaskSync(BaseCallback):
     any ``EvalCallback``.
 
     It raises a ``TypeError`` when the training environment is not continual, and a ``ValueError`` when environments side by
-    side do not have the same tasks at the same times, or an evaluation environment has other tasks than they.
+    side do not have the same tasks at the same times, or an evaluation environment has other tasks than they or is
+    one of them.
     """
 
     def _on_training_start(self) -> None:
@@ -33,6 +34,7 @@ class TaskSync(BaseCallback):
         env = self.training_env
         _check_side_by_side(env)
         for eval_env in eval_envs:
+            check_apart(env, eval_env)
             check_same_tasks(env, eval_env)
         if any(env.env_method("set_clock", self.num_timesteps, env.num_envs)):
             # The environments were reset before they were told the time, into an episode of the wrong task
