@@ -1,6 +1,7 @@
 """In rollouts the layers of a plain MLP policy are called directly, with the same results."""
 
 import copy
+from types import MethodType
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
+from torch.nn.modules.module import register_module_forward_hook
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
@@ -49,6 +51,57 @@ OTHERS = {
 
 def make(policy="MlpPolicy", env=None, algorithm=PPO, **arguments):
     return algorithm(policy, env or RandomEnv(), **{**PPO_SETTINGS, **arguments})
+
+
+def _forbid_action_0(policy):
+    def masked(self, latent):
+        logits = self.action_net(latent).clone()
+        logits[:, 0] = -1e9
+        return self.action_dist.proba_distribution(logits)
+
+    policy._get_action_dist_from_latent = MethodType(masked, policy)
+
+
+def _double_outputs(policy):
+    forward = policy.action_net.forward
+    policy.action_net.forward = lambda latent: 2 * forward(latent)
+
+
+def _shift_features(policy):
+    extract = policy.extract_features
+    policy.extract_features = lambda obs, *args: 1 + extract(obs, *args)
+
+
+def _swap_hidden(policy):
+    policy.mlp_extractor.forward_actor = policy.mlp_extractor.forward_critic
+
+
+@pytest.mark.parametrize("churn_coef", [0.0, 1e-6])
+@pytest.mark.parametrize("change", [_forbid_action_0, _double_outputs, _shift_features, _swap_hidden])
+def test_methods_replaced_on_the_policy_are_called(change, churn_coef):
+    def learned(change, **arguments):
+        model = make(**arguments)
+        change(model.policy)
+        return list(model.learn(128).policy.parameters())
+
+    arguments = dict(algorithm=CChainPPO, churn_coef=churn_coef)
+    plain, changed, unchanged = learned(change), learned(change, **arguments), learned(lambda policy: None, **arguments)
+    # With λ near 0, to rounding
+    assert all(th.allclose(a, b, rtol=1e-3, atol=1e-5) for a, b in zip(plain, changed, strict=True))
+    assert not all(th.allclose(a, b, rtol=1e-3, atol=1e-5) for a, b in zip(plain, unchanged, strict=True))
+
+
+def test_hooks_of_all_modules_are_called():
+    calls = {}
+    for algorithm in (PPO, CChainPPO):
+        seen = []
+        hook = register_module_forward_hook(lambda *_, seen=seen: seen.append(None))
+        try:
+            make(algorithm=algorithm, **({} if algorithm is PPO else {"churn_coef": 0.0})).learn(64)
+        finally:
+            hook.remove()
+        calls[algorithm] = len(seen)
+    assert calls[CChainPPO] == calls[PPO] > 64
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

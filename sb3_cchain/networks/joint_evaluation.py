@@ -8,7 +8,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_cchain.networks.policy_inputs import joined, n_observations
-from sb3_cchain.networks.policy_networks import PolicyNetworks, hooks_of
+from sb3_cchain.networks.policy_networks import PolicyNetworks, is_instrumented
 from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution, has_training_mode
 
 
@@ -26,15 +26,15 @@ def can_evaluate_jointly(policy: ActorCriticPolicy) -> bool:
     """
     :param policy: An actor-critic policy
     :return: Whether :func:`evaluate_jointly` does what its ``evaluate_actions()`` does: it evaluates actions and makes its
-        distribution as SB3's do, no hook looks at its batches, and the outputs of one sample depend neither on the others nor
-        on training or evaluation mode
+        distribution as SB3's do, no hook looks at its batches, no method of a module was replaced, and the outputs of one
+        sample depend neither on the others nor on training or evaluation mode
     """
     return (
         getattr(policy.evaluate_actions, "__func__", None) is ActorCriticPolicy.evaluate_actions
         and type(policy).extract_features is ActorCriticPolicy.extract_features
-        and not has_own_distribution(type(policy))
+        and not has_own_distribution(policy)
         and not has_training_mode(policy)
-        and not any(hooks_of(policy))
+        and not is_instrumented(policy)
     )
 
 

@@ -32,12 +32,7 @@ def has_plain_forward(policy: nn.Module) -> bool:
     :param policy: A policy
     :return: Whether its networks are plain, and its forward pass is that of SB3's actor-critic policies
     """
-    return (
-        is_plain(policy)
-        and type(policy).forward is ActorCriticPolicy.forward
-        and "forward" not in vars(policy)
-        and not has_own_distribution(type(policy))
-    )
+    return is_plain(policy) and type(policy).forward is ActorCriticPolicy.forward and not has_own_distribution(policy)
 
 
 class LeanForward:

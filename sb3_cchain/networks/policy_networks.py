@@ -14,6 +14,8 @@ from torch.nn import functional as F
 
 FORWARD_HOOKS = ("_forward_pre_hooks", "_forward_hooks")
 BACKWARD_HOOKS = ("_backward_pre_hooks", "_backward_hooks")
+# What a forward pass calls of a policy and its modules
+_METHODS = ("forward", "extract_features", "forward_actor", "forward_critic")
 
 
 class PolicyNetworks:
@@ -114,10 +116,20 @@ def hooks_of(policy: nn.Module, kinds: Sequence[str] = (*FORWARD_HOOKS, *BACKWAR
     return [getattr(module, kind) for module in policy.modules() for kind in kinds]
 
 
+def is_instrumented(policy: nn.Module) -> bool:
+    """
+    :param policy: A policy
+    :return: Whether hooks look at its modules, or a method was replaced on one of them, not in its class
+    """
+    replaced = any(name in vars(module) for module in policy.modules() for name in _METHODS)
+    return replaced or any(hooks_of(policy)) or bool(nn.modules.module._has_any_global_hook())
+
+
 def is_plain(policy: nn.Module) -> bool:
     """
     :param policy: A policy
     :return: Whether it is an actor-critic policy of SB3 that takes vectors and has MLPs for actor and critic, without hooks
+        and replaced methods
     """
     return (
         isinstance(policy, ActorCriticPolicy)  # not so when compiled
@@ -127,7 +139,7 @@ def is_plain(policy: nn.Module) -> bool:
         and type(policy.features_extractor) is FlattenExtractor
         and type(policy.mlp_extractor) is MlpExtractor
         and type(policy.mlp_extractor.policy_net) is type(policy.mlp_extractor.value_net) is nn.Sequential
-        and not any(hooks_of(policy))
+        and not is_instrumented(policy)
     )
 
 

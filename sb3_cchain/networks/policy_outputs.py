@@ -51,7 +51,7 @@ def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Te
         ``MultiDiscrete`` (shorter sub-actions padded with 0) and ``(batch_size, n, 2)`` for ``MultiBinary`` actions;
         means ``(batch_size, action_dim)`` for ``Box`` (before squashing, with gSDE)
     """
-    if has_own_distribution(type(uncompiled(policy))):
+    if has_own_distribution(uncompiled(policy)):
         return distribution_outputs(policy.get_distribution(observations))
     # The same without the distribution, whose construction costs as much as the network
     return actor_outputs(PolicyNetworks(policy), observations)
@@ -99,13 +99,13 @@ def distribution_of(policy: ActorCriticPolicy, latent: th.Tensor, outputs: th.Te
     return policy.action_dist.proba_distribution(outputs)
 
 
-def has_own_distribution(policy_class: type[nn.Module]) -> bool:
+def has_own_distribution(policy: nn.Module) -> bool:
     """
-    :param policy_class: Class of an actor-critic policy
-    :return: Whether it makes its action distribution otherwise than SB3's
+    :param policy: An actor-critic policy
+    :return: Whether it makes its action distribution otherwise than SB3's, by its class or by a method replaced on it
     """
     return any(
-        getattr(policy_class, name) is not getattr(ActorCriticPolicy, name)
+        getattr(getattr(policy, name), "__func__", None) is not getattr(ActorCriticPolicy, name)
         for name in ("get_distribution", "_get_action_dist_from_latent")
     )
 
