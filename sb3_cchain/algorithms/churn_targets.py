@@ -98,14 +98,21 @@ class ChurnTarget:
             return self.outputs(policy, reference)
         return self.outputs(policy, {"observations": reference})
 
-    def base_loss(self, model: BaseAlgorithm, without_entropy: bool = False) -> float:
+    def base_loss(self, model: BaseAlgorithm, logged: Mapping[str, float], without_entropy: bool = False) -> float:
         """
         :param model: A model, right after its ``train()``
+        :param logged: What ``train()`` has logged
         :param without_entropy: Whether only the first of the losses counts
-        :return: L, as the model has logged it
+        :return: L
+        :raises ValueError: When ``train()`` has not logged what L is made of
         """
-        logged = model.logger.name_to_value
-        losses = list(self.losses.items())[:1] if without_entropy else self.losses.items()
+        losses = list(self.losses.items())[:1] if without_entropy else list(self.losses.items())
+        missing = [name for name, _ in losses if name not in logged]
+        if missing:
+            raise ValueError(
+                f"`train()` of {type(model).__name__} must log {' and '.join(missing)}, as SB3's does: churn reduction "
+                "measures the churn loss by it"
+            )
         return sum(logged[name] * (1.0 if factor is None else getattr(model, factor)) for name, factor in losses)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
+from sb3_cchain.algorithms.recorded import recorded
 from sb3_cchain.algorithms.replay_observations import sample_observations, sample_with_actions
 from sb3_cchain.churn import ChurnReducer, extra_gradient
 from sb3_cchain.churn.divergence import mean_absolute_change
@@ -48,10 +49,11 @@ def reduced_off_policy(model: Any, reducers: Mapping[str, ChurnReducer]) -> Iter
             coefs[name] = reducer.coefficient.value
             before_update = partial(_hold_still, model, targets[name], reducer, changes[name])
             stack.enter_context(extra_gradient(optimizers[targets[name].optimizer], before_update))
+        logged = stack.enter_context(recorded(model.logger))
         yield
     for name, reducer in reducers.items():
         if reducer.losses:
-            loss = abs(targets[name].base_loss(model))
+            loss = abs(targets[name].base_loss(model, logged))
             prefix = "churn" if len(reducers) == 1 else f"churn/{name}"
             churn_loss = np.mean(reducer.losses)
             model.logger.record_mean(f"{prefix}/loss", churn_loss)

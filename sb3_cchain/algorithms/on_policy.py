@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.last_surrogate import last_surrogate
+from sb3_cchain.algorithms.recorded import recorded
 from sb3_cchain.algorithms.reference_batches import (
     REFERENCES,
     PreviousRollout,
@@ -65,13 +66,23 @@ class PolicyChurnOptions:
         check_number("churn_batch_size", self.churn_batch_size, minimum=0, exclusive=True)
 
 
-def _goes_jointly(policy: ActorCriticPolicy, options: PolicyChurnOptions) -> bool:
+def _goes_jointly(model: Any, policy: ActorCriticPolicy, options: PolicyChurnOptions) -> bool:
     """Whether reference batches can go through the policy with the minibatches, and that takes less time."""
     return (
-        options.churn_component == "full"
-        and (options.churn_reference == "next" or not has_convolutions(policy))
+        (options.churn_reference == "next" or not has_convolutions(policy))
         and can_evaluate_jointly(policy)
+        and has_sb3s_train(model)
     )
+
+
+def has_sb3s_train(model: Any) -> bool:
+    """
+    :param model: A model
+    :return: Whether its ``train()`` is SB3's, by which ``zero_grad()`` comes after the evaluation of a minibatch, and the loss
+        has the values in it
+    """
+    classes = [base for base in type(model).__mro__ if "train" in vars(base)]
+    return all(base.__module__.startswith(("stable_baselines3.", "sb3_cchain.")) for base in classes)
 
 
 def rollout_references(model: Any, reducers: Mapping[str, ChurnReducer], options: PolicyChurnOptions) -> RolloutReferences:
@@ -152,9 +163,10 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         if options.churn_component != "full":
             backward = stack.enter_context(component_backward(list(policy.parameters()), options.churn_component))
             adders["policy"] = partial(hold_still, "policy", backward)
-        elif "policy" in reducers and isinstance(references, ReferenceBatches) and _goes_jointly(policy, options):
+        elif "policy" in reducers and isinstance(references, ReferenceBatches) and _goes_jointly(model, policy, options):
             adders["policy"] = stack.enter_context(joint_passes(policy, reducers["policy"], references))
         stack.enter_context(replaced(model.rollout_buffer, "get", references.get))
+        logged = stack.enter_context(recorded(model.logger))
         surrogate = stack.enter_context(last_surrogate(model)) if options.churn_base_loss == "last" else None
         stack.enter_context(extra_gradient(policy.optimizer, lambda: before_update(adders)))
         yield
@@ -163,7 +175,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         if isinstance(references, PreviousRollout):
             reducer.next_reference = references.current
         if reducer.losses:
-            loss = _take_losses(model, targets[name], reducer, options, surrogate)
+            loss = _take_losses(model, logged, targets[name], reducer, options, surrogate)
             _log(model.logger, name, "churn" if len(reducers) == 1 else f"churn/{name}", reducer, coefs[name], loss)
             reducer.end_iteration(loss)
     if value_churns:
@@ -172,6 +184,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
 
 def _take_losses(
     model: Any,
+    logged: Mapping[str, float],
     target: ChurnTarget,
     reducer: ChurnReducer,
     options: PolicyChurnOptions,
@@ -179,7 +192,7 @@ def _take_losses(
 ) -> float:
     """|L|. Of the churn losses, those of the updates that count are left."""
     if surrogate is None:
-        return abs(target.base_loss(model, without_entropy=options.churn_base_loss == "surrogate"))
+        return abs(target.base_loss(model, logged, without_entropy=options.churn_base_loss == "surrogate"))
     reducer.losses = reducer.losses[-1:]
     return abs(surrogate())
 

@@ -1,0 +1,118 @@
+"""Algorithms, loggers and environments of users that do what SB3 allows, but not what its own do."""
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import HumanOutputFormat, Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
+
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv
+from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
+from tests.envs import RandomEnv
+
+
+class OwnLoop(PPO):
+    """Begins its updates with ``zero_grad()``, and has a loss without the values."""
+
+    def train(self):
+        losses = []
+        for data in self.rollout_buffer.get(self.batch_size):
+            self.policy.optimizer.zero_grad()
+            _, log_prob, entropy = self.policy.evaluate_actions(data.observations, data.actions.long().flatten())
+            loss = -(data.advantages * th.exp(log_prob - data.old_log_prob)).mean()
+            loss.backward()
+            self.policy.optimizer.step()
+            losses.append(loss.item())
+        self.logger.record("train/policy_gradient_loss", np.mean(losses))
+        self.logger.record("train/entropy_loss", -entropy.mean().item())
+
+
+def test_an_own_train_is_trained_with_churn_reduction():
+    churns = {}
+    for coef in (1e-6, 1e3):
+        model = OwnLoop("MlpPolicy", "CartPole-v1", learning_rate=1e-3, **PPO_SETTINGS)
+        model.learn(256, CChainCallback(churn_coef=coef))
+        churns[coef] = model.logger.name_to_value["churn/policy_churn"]
+    assert 0 < 10 * churns[1e3] < churns[1e-6]
+
+
+class Prefixed(Logger):
+    """Several agents in one log."""
+
+    def record(self, key, value, exclude=None):
+        super().record(f"agent/{key}", value, exclude)
+
+
+@pytest.mark.parametrize("algorithm", [CChainPPO, CChainSAC])
+def test_the_logger_may_have_other_names(algorithm, capsys):
+    settings = PPO_SETTINGS if algorithm is CChainPPO else {**DQN_SETTINGS, "train_freq": 8}
+    coefs = []
+    for logger in (Logger, Prefixed):
+        model = algorithm("MlpPolicy", "Pendulum-v1", churn_warmup=1, **settings)
+        model.set_logger(logger(None, [HumanOutputFormat(sys.stdout)]))
+        model.learn(96, log_interval=1)
+        model.logger.dump(1)
+        coefs.append(model.churn_reducer.coefficient.value)
+    assert coefs[0] == coefs[1] not in (0, 1)
+    assert "agent/" in capsys.readouterr().out
+
+
+def test_a_loss_that_is_not_logged_is_named():
+    class Silent(SAC):
+        def train(self, gradient_steps, batch_size=64):
+            logger, self._logger = self._logger, Logger(None, [])
+            super().train(gradient_steps, batch_size)
+            self._logger = logger
+
+    model = Silent("MlpPolicy", "Pendulum-v1", learning_starts=8, buffer_size=64, batch_size=8, device="cpu")
+    with pytest.raises(ValueError, match=r"`train\(\)` of Silent must log train/actor_loss, as SB3's does"):
+        model.learn(16, CChainCallback())
+
+
+class Lists(VecEnvWrapper):
+    """Its rewards are a list, and it has no attributes to give."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards.tolist(), dones, infos
+
+    def get_attr(self, attr_name, indices=None):
+        return [None] * self.num_envs
+
+    def has_attr(self, attr_name):
+        return True
+
+
+@pytest.mark.parametrize("algorithm", [CChainPPO, CChainDQN])
+def test_an_own_vectorised_environment(algorithm):
+    base = PPO if algorithm is CChainPPO else DQN
+    settings = PPO_SETTINGS if base is PPO else DQN_SETTINGS
+    env = Lists(DummyVecEnv([lambda: RandomEnv(action_space=spaces.Discrete(2))]))
+    assert algorithm("MlpPolicy", env, **settings).learn(64).num_timesteps == 64
+
+
+class WithoutOptions(gym.Env):
+    """Its ``reset()`` takes no options, which SB3 does not ask for."""
+
+    observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(2)
+
+    def reset(self, seed=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+def test_tasks_whose_reset_takes_no_options(tmp_path):
+    env = ContinualEnv([WithoutOptions, WithoutOptions], steps_per_task=64)
+    model = CChainPPO("MlpPolicy", make_vec_env(lambda: env), **PPO_SETTINGS).learn(128)
+    assert model.num_timesteps == 128 and env.task_id == 1
