@@ -186,3 +186,9 @@ def test_a_train_method_of_the_user_stays():
     model.learn(48, callback=CChainCallback())
     assert calls == [16, 32, 48]
     assert model.train is train
+
+
+def test_the_callback_takes_larger_reference_batches():
+    callback = CChainCallback(churn_batch_size=2.0)
+    PPO("MlpPolicy", RandomEnv(), n_steps=32, batch_size=8, device="cpu").learn(32, callback)
+    assert len(callback.churn_reducer.reference) == 16

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_cchain.analysis.metrics import continual
+from sb3_cchain.analysis.metrics.continual import recovery_times
 from sb3_cchain.callbacks.continual_metrics import task_averages
 
 # Rollouts of 10 steps, three tasks of 40, 40 and 20
@@ -121,3 +122,9 @@ def test_isolated_changes():
 def test_isolated_changes_of_negative_returns_and_of_none():
     changes = continual.isolated_changes([-10.0, 0.0], [[-5.0, 0.0], [-8.0, 0.0]])
     assert changes[:, 0] == pytest.approx([1.0, -0.6]) and np.isnan(changes[:, 1]).all()
+
+
+def test_recovery_is_to_the_last_five_rollouts():
+    values = [100.0] * 3 + [1.0] * 5
+    rows = [dict(timesteps=10 * i, task_id=0, n_episodes=1, mean_return=value) for i, value in enumerate(values)]
+    assert recovery_times([*rows, dict(timesteps=90, task_id=1, n_episodes=1, mean_return=1.0)]).tolist() == [20]

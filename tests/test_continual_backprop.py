@@ -6,6 +6,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_cchain.methods import ContinualBackprop
+from sb3_cchain.methods import continual_backprop as module
 from sb3_cchain.methods.continual_backprop import Usefulness, hand_over_means
 from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units, received_activity
 from sb3_cchain.networks.extractors import MinAtarCNN
@@ -139,3 +140,29 @@ def test_what_it_refuses():
     ]:
         with pytest.raises(ValueError, match=f"`{argument}` must be .* got {value!r}"):
             ContinualBackprop(**{argument: value})
+
+
+def test_utilities_are_running_averages():
+    model = make_model(
+        "PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[4], activation_fn=nn.ReLU), learning_rate=0.0, n_epochs=1
+    )  # two updates
+    contributions = []
+
+    class Spy(ContinualBackprop):
+        def _contribution(self, *arguments):
+            contributions.append(super()._contribution(*arguments))
+            return contributions[-1]
+
+    callback = Spy(decay_rate=0.5)
+    model.learn(16, callback=callback)
+    first, second = contributions[0], contributions[len(callback._layers)]
+    assert th.allclose(callback._usefulness[0].utility, 0.25 * first + 0.5 * second)
+
+
+def test_recycled_units_have_no_utility_and_the_batch_has_its_size(monkeypatch):
+    sizes, sample = [], module.sample_batch
+    monkeypatch.setattr(module, "sample_batch", lambda model, n: (sizes.append(n), sample(model, n))[1])
+    callback = ContinualBackprop(replacement_rate=0.5, maturity_threshold=0, batch_size=3)
+    make_model("PPO", env=make_random_env()).learn(16, callback=callback)
+    assert set(sizes) == {3}
+    assert all((u.ages == 0).any() and (u.utility[u.ages == 0] == 0).all() for u in callback._usefulness)

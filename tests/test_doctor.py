@@ -4,6 +4,7 @@ import json
 import math
 import warnings
 from functools import cache, partial
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +21,7 @@ from torch import nn
 from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, DoubleDQN, TrainingCheckpoint, resume
 from sb3_cchain.algorithms.contrib import CChainTQC
 from sb3_cchain.analysis import Doctor, remedies
+from sb3_cchain.analysis import doctor as doctor_module
 from sb3_cchain.analysis.findings import BY_NAME, CHECKS, diagnose, findings_markdown
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.analysis.model_outputs import ModelOutputs
@@ -452,3 +454,23 @@ def test_the_page_needs_nothing_beside_it():
 def test_the_documentation_has_the_table_of_the_code():
     page = (ROOT / "docs" / "modules" / "doctor.md").read_text()
     assert findings_markdown() in page, "python -m benchmarks.doctor --write"
+
+
+def test_patience_and_size_of_the_batch(monkeypatch):
+    sizes, sample = [], doctor_module.sample_batch
+    monkeypatch.setattr(doctor_module, "sample_batch", lambda model, n: (sizes.append(n), sample(model, n))[1])
+    doctor = Doctor(interval=1, patience=4, batch_size=50)
+    messages = warned(lambda: dead_units().learn(64 * 4, callback=doctor, log_interval=100))
+    assert set(sizes) == {50} and messages and all(message.startswith("At step 256") for message in messages)
+
+
+def test_a_finding_must_hold_in_a_row():
+    doctor = Doctor(patience=2)
+    doctor.num_timesteps = 0
+    finding = SimpleNamespace(check=SimpleNamespace(name="a"), value=1.0, sentence=lambda: "a.", remedies=[])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for doctor.findings in ([finding], [], [finding]):
+            doctor._warn()
+    with pytest.warns(UserWarning):
+        doctor._warn()

@@ -485,3 +485,8 @@ def test_reset_of_the_coefficient_at_a_switch():
     # 6 iterations, 3 of them of the second task
     assert kept.churn_reducer.coefficient.n_seen == 6
     assert reset.churn_reducer.coefficient.n_seen == 3
+
+
+def test_offsets_have_the_standard_deviation():
+    one, other = (gym.make("Continual/CartPole-v1", offset_std=std).unwrapped.offsets for std in (1.5, 3.0))
+    assert np.allclose(2 * one, other)

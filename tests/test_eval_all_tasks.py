@@ -303,3 +303,10 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     (tmp_path / "all.csv").write_text("timesteps,task_id,n_episodes,mean_return\n")
     with pytest.raises(ValueError, match="its first line must be 'timesteps,trained_task"):
         evaluate(tmp_path / "all.csv")
+
+
+def test_statistics_that_a_signal_restarts_are_those_of_the_moment():
+    env, eval_env = (TaskVecNormalize(make_vec_env(tasks)) for _ in range(2))
+    callback = Means(eval_env, n_eval_episodes=1)
+    PPO("MlpPolicy", env, **ARGUMENTS).learn(48, [TaskSync(), TaskSignal(switch_at=[16]), callback])
+    assert callback.counts == [1, 16, 32]

@@ -5,10 +5,11 @@ import pytest
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.logger import Logger
 
-from sb3_cchain import CChainPPO, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.tensorboard.layout import layout_of
+from tests.envs import CountEnv
 from tests.resume_cases import Record
 from tests.test_eval_all_tasks import ARGUMENTS, tasks
 
@@ -57,3 +58,35 @@ def test_sampled_actions_leave_training_as_it_is():
         parameters.append(model.policy.state_dict())
     assert len(model.evaluations) == 4
     assert all(np.array_equal(parameters[0][name], parameters[1][name]) for name in parameters[0])
+
+
+class Recorded(CountEnv):
+    actions, firsts = [], []
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.firsts.append(float(observation[0]))
+        return observation, info
+
+    def step(self, action):
+        self.actions.append(int(action))
+        return super().step(action)
+
+
+Recorded.__name__ = "CountEnv"  # the same tasks as those of training
+
+
+def evaluate(**arguments):
+    Recorded.actions, Recorded.firsts = [], []
+    settings = dict(n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+    model = PPO("MlpPolicy", ContinualEnv([CountEnv] * 2, 32), **settings)
+    model.learn(16, [TaskSync(), EvalTrainedTask(ContinualEnv([Recorded] * 2, 32), **arguments)])
+    return len(Recorded.actions), set(Recorded.actions), Recorded.firsts
+
+
+def test_arguments_of_an_evaluation_hold():
+    n_steps, actions, firsts = evaluate(n_eval_episodes=1)
+    assert n_steps > 0 and len(actions) == 1
+    assert evaluate(n_eval_episodes=3)[0] == 3 * n_steps
+    assert evaluate(n_eval_episodes=5, deterministic=False)[1] == {0, 1}
+    assert evaluate(n_eval_episodes=1, seed=5)[2] != firsts

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO, TaskSync
@@ -201,3 +202,16 @@ def test_what_it_refuses():
         )
     with pytest.raises(TypeError, match="the training environment is not one"):
         PPO("MlpPolicy", RandomEnv(), policy_kwargs=policy_kwargs(), device="cpu").learn(10, callback=EWCConsolidation())
+
+
+def test_replayed_observations_are_normalised():
+    env, seen = VecNormalize(make_vec_env(make_env, 1)), []
+
+    class Look(Spy):
+        def _consolidate(self, observations):
+            raw = self.model.replay_buffer.observations[self.num_timesteps - 1, 0]
+            seen.append((observations[-1], env.normalize_obs(raw)))
+
+    model = DQN("MlpPolicy", env, device="cpu", seed=0, **{**OFF_POLICY, "policy_kwargs": policy_kwargs()})
+    model.learn(STEPS_PER_TASK + 8, callback=[TaskSync(), Look(n_samples=4)])
+    assert len(seen) == 1 and np.allclose(*seen[0])

@@ -190,3 +190,9 @@ def test_means_stay():
     restart = LogStdRestart()
     model.learn(32, [TaskSignal(switch_at=[16]), spy, restart, other := Spy(spy.read)])
     assert spy.before_rollouts == other.before_rollouts
+
+
+def test_the_exploration_rate_ends_where_it_is_told():
+    model = make_model("DQN", CountEnv())
+    model.learn(60, [TaskSignal(switch_at=[20]), ExplorationRateRestart(0.8, final_eps=0.3, n_steps=10)])
+    assert model.exploration_rate == pytest.approx(0.3)

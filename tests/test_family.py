@@ -20,8 +20,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_cchain
 from sb3_cchain import CChainCallback, ChurnMonitor
-from sb3_cchain.algorithms.churn_targets import churn_kind
+from sb3_cchain.algorithms.churn_targets import KINDS, churn_kind
 from sb3_cchain.algorithms.reference_batches import PreviousRollout
+from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from tests.churn_models import DICT, IMAGE, NormalisedExtractor, assert_close, assert_equal, differ, go_on
 from tests.envs import RandomEnv
 from tests.sb3_source import COEF, NUMBERED_MINIBATCHES, rewritten
@@ -486,3 +487,86 @@ def test_without_sb3_contrib(monkeypatch):
     with pytest.raises(AttributeError, match="no attribute 'CChainARS'"):
         sb3_cchain.CChainARS  # noqa: B018
     assert "CChainTQC" in dir(sb3_cchain)
+
+
+def expected_base_loss(member, target, logged, model):
+    if member.name in ("SAC", "TQC", "CrossQ", "TD3", "DDPG"):
+        return logged["train/actor_loss" if target == "policy" else "train/critic_loss"]
+    if member.name in ("DQN", "QRDQN"):
+        return logged["train/loss"]
+    if target == "value":
+        return logged["train/value_loss"] * (1 if member.name == "TRPO" else model.vf_coef)
+    policy = logged["train/policy_loss" if member.name == "A2C" else "train/policy_gradient_loss"]
+    return policy + model.ent_coef * logged["train/entropy_loss"]
+
+
+@pytest.mark.filterwarnings("ignore:Over 1 iterations")
+@each_target
+def test_lambda_compares_with_the_loss_that_was_logged(member, target):
+    of_actor_critic = dict(ent_coef=0.3, vf_coef=0.7) if member.name in ("PPO", "A2C", "MaskablePPO", "RecurrentPPO") else {}
+    model = learn(member.make(churn_target=target, churn_warmup=0, churn_window=1, **of_actor_critic))
+    for name, reducer in model.churn_reducers.items():
+        expected = abs(expected_base_loss(member, name, model.logger.name_to_value, model))
+        assert reducer.coefficient.base_losses.item() == pytest.approx(expected, rel=1e-5), name
+
+
+DEFAULTS = {  # β of discrete and of continuous policies, of values; warm-up and window
+    **dict.fromkeys(("MaskablePPO", "RecurrentPPO"), (1e2, 0.05, 0.01, 10, 50)),
+    **dict.fromkeys(("SAC", "TQC", "CrossQ", "TD3"), (None, 5e-5, 1e-3, 0, 1000)),
+    "PPO": (1e4, 0.05, 0.01, 10, 50),
+    "A2C": (10, 5e-5, 1e-3, 0, 1000),
+    "TRPO": (None, None, 1e-3, 0, 50),
+    "DQN": (None, None, 0.01, 0, 1000),
+    "QRDQN": (None, None, 1e-3, 0, 1000),
+}
+
+
+def test_all_defaults_are_the_tables():
+    assert DEFAULTS.keys() == KINDS.keys()
+    for name, (discrete, continuous, value, *lengths) in DEFAULTS.items():
+        kind = KINDS[name]
+        policy = kind.targets["policy"].target_ratios if "policy" in kind.targets else {}
+        assert (policy.get(cross_entropy), policy.get(mean_squared_difference)) == (discrete, continuous), name
+        assert kind.targets["value"].target_ratios == {mean_squared_difference: value}, name
+        assert [kind.warmup, kind.window] == lengths, name
+
+
+def test_the_least_coefficient_arrives():
+    assert FAMILY["PPO"].make(churn_coef_min=3.0).churn_reducer.coefficient.minimum == 3.0
+
+
+@pytest.mark.parametrize("name, n_steps, n_losses", [("PPO", 32, 8), ("SAC", 1, 1)])
+def test_losses_of_an_interrupted_train_do_not_count(name, n_steps, n_losses):
+    model, n_updates, seen = FAMILY[name].make(), 0, []
+    reducer = model.churn_reducer
+    end = reducer.end_iteration
+    reducer.end_iteration = lambda *args, **kwargs: (seen.append(len(reducer.losses)), end(*args, **kwargs))
+
+    def stop(*_):
+        nonlocal n_updates
+        n_updates += 1
+        if n_updates == 5:
+            raise KeyboardInterrupt
+
+    (model.policy.optimizer if name == "PPO" else model.policy.actor.optimizer).register_step_post_hook(stop)
+    with pytest.raises(KeyboardInterrupt):
+        learn(model, 64)
+    seen.clear()
+    model.learn(n_steps, reset_num_timesteps=False)
+    assert seen == [n_losses]
+
+
+@pytest.mark.parametrize("name", ["SAC", "QRDQN"])
+def test_value_churn_is_the_mean_absolute_change(name):
+    model, seen = FAMILY[name].make(churn_target="value"), []
+    backward = model.churn_reducer.backward
+
+    def spy(*args):
+        old, new = model.churn_reducer.old_outputs, backward(*args)
+        if new is not None:
+            seen.append((old - new).abs().mean().item())
+        return new
+
+    model.churn_reducer.backward = spy
+    learn(model, 64)
+    assert model.logger.name_to_value["churn/value_churn"] == pytest.approx(np.mean(seen), rel=1e-4)

@@ -199,3 +199,13 @@ def test_prediction_of_a_policy_with_nan(action_space, deterministic):
         model.policy.action_net.weight[:] = np.nan
     with pytest.raises(ValueError, match="outputs of the policy network are NaN"):
         model.predict(np.ones(4, np.float32), deterministic=deterministic)
+
+
+def test_the_last_observation_of_an_episode_alone():
+    class Last(FaultyEnv):
+        def reset(self, **kwargs):
+            return RandomEnv.reset(self, **kwargs)
+
+    model = CChainPPO("MlpPolicy", vectorise(Last("observation", 10)), n_steps=32, batch_size=8, device="cpu")
+    with pytest.raises(ValueError, match="infinite observation at step 10 "):
+        model.learn(64)

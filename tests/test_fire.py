@@ -104,3 +104,9 @@ def test_layer_norms_and_biases_stay():
     assert trained_weights(network) == ["0.weight", "2.weight"]
     network[0].weight.requires_grad_(False)
     assert trained_weights(network) == ["2.weight"]
+
+
+def test_fire_does_convolutions():
+    network = nn.Sequential(nn.Conv2d(1, 2, 3), nn.Conv1d(1, 2, 3), nn.Linear(2, 2))
+
+    assert trained_weights(network) == ["0.weight", "1.weight", "2.weight"]

@@ -80,3 +80,8 @@ def test_it_says_what_to_install(monkeypatch, missing):
         monkeypatch.setitem(__import__("sys").modules, missing, None)
     with pytest.raises(ImportError, match=r'pip install "sb3-cchain\[psgd\]"'):
         Kron([nn.Parameter(th.ones(2, 2))])
+
+
+def test_arguments_reach_kron():
+    group = Kron([nn.Parameter(th.ones(2, 2))], momentum=0.8, weight_decay=0.3, max_size_triangular=7).param_groups[0]
+    assert (group["momentum"], group["weight_decay"], group["max_size_triangular"]) == (0.8, 0.3, 7)

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSignal, TaskSync
 from sb3_cchain.callbacks import TaskLearningStarts, read_returns
+from sb3_cchain.callbacks.continual_metrics import task_averages
 from sb3_cchain.callbacks.returns_file import ReturnsFile
 from sb3_cchain.envs import RewardScale
 from sb3_cchain.methods import Oracle
@@ -344,3 +345,30 @@ def test_a_file_is_locked_while_it_is_moved_aside(tmp_path, monkeypatch):
     file.append([row])
     file.close()
     assert moved == ["returns.csv.1"] and read_returns(path) == read_returns(tmp_path / "returns.csv.1") == [row]
+
+
+class Rising(CountEnv):
+    n_episodes = 0
+
+    def reset(self, **kwargs):
+        self.n_episodes += 1
+        self.task_reward = float(self.n_episodes)
+        return super().reset(**kwargs)
+
+
+def test_averages_of_returns_that_differ():
+    spy = Spy()
+    env = ContinualEnv([lambda: Rising(length=8)] * 2, 64)
+    model = CChainPPO("MlpPolicy", env, n_steps=16, batch_size=8, seed=0, device="cpu")
+    for n_steps in (16, 16, 64):  # goes on within the first task
+        model.learn(n_steps, spy, reset_num_timesteps=False)
+    averages = task_averages(model.continual_returns)
+    assert spy.logged[3]["average_task_0"] == pytest.approx(averages[0])
+    assert spy.logged[-1]["average_task_1"] == pytest.approx(averages[1])
+    assert spy.logged[-1]["average_performance"] == pytest.approx(np.mean(list(averages.values())))
+
+
+def test_reward_per_step_of_a_rollout_across_a_switch():
+    spy = Spy()
+    CChainPPO("MlpPolicy", make_env(), n_steps=48, batch_size=8, device="cpu").learn(48, spy)
+    assert spy.logged[0]["reward_per_step"] == 2  # of the 16 steps in the second task

@@ -560,3 +560,10 @@ def test_what_it_refuses():
             NetworkHealth(**{argument: value})
     with pytest.raises(TypeError, match="NetworkHealth is for on-policy and off-policy algorithms, got ARS"):
         ARS("LinearPolicy", BOX_ENV(), n_delta=1, device="cpu").learn(10, callback=NetworkHealth())
+
+
+def test_of_crelu_with_three_units():
+    model = make_tiny_model(CReLUPolicy, net_arch=dict(pi=[3], vf=[]), activation_fn=CReLU)
+    set_weights(model.policy, mlp_extractor_policy_net_0_weight=[[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    health = network_health(model, th.tensor([[1.0, 0.0], [-1.0, 0.0]]))
+    assert (health["active_share"], health["dormant_share"]) == (pytest.approx(1 / 3), pytest.approx(2 / 3))

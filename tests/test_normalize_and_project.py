@@ -71,3 +71,11 @@ def test_what_it_refuses():
             NormalizeAndProject(parameters, **arguments)
     with pytest.raises(ValueError, match="`n_output_layers` must leave a weight matrix to project, got 1"):
         NormalizeAndProject(parameters, n_output_layers=1)
+
+
+def test_convolutions_are_projected():
+    convolution, output = nn.Parameter(th.full((1, 1, 1, 1), 2.0)), nn.Parameter(th.ones(1, 1))
+    optimizer = NormalizeAndProject([convolution, output], lr=1.0, n_output_layers=1, base_class=th.optim.SGD)
+    convolution.grad = -th.ones_like(convolution)
+    optimizer.step()
+    assert convolution.item() == 2.0

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import QRDQN
 from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cchain import CChainDQN, CChainPPO
@@ -17,7 +21,9 @@ from sb3_cchain.analysis import NTKCallback
 from sb3_cchain.analysis.metrics.gradients import minibatch_gradients
 from sb3_cchain.analysis.metrics.ntk import diagonal_sum, gram_matrix, ntk_statistics, off_diagonal_sum
 from sb3_cchain.analysis.ntk import policy_ntk, q_ntk
+from tests.churn_models import NormalisedExtractor
 from tests.envs import RandomEnv
+from tests.test_family import FAMILY
 
 KEYS = ["condition_number", "diagonal_sum", "effective_rank", "off_diagonal_sum", "srank"]
 
@@ -350,3 +356,77 @@ def test_sb3_contrib():
     model = contrib.RecurrentPPO("MlpLstmPolicy", "CartPole-v1", n_steps=32, batch_size=16, seed=0, device="cpu")
     with pytest.raises(TypeError, match="recurrent"):
         model.learn(32, callback=NTKCallback(n_minibatches=5))
+
+
+def test_delta_of_the_callback_holds():
+    callback = NTKCallback(n_minibatches=8, delta=0.5, picture_interval=0)
+    model = make_ppo("discrete").learn(24, callback, log_interval=99)
+    expected, default = (ntk_statistics(callback.matrix, delta)["srank"] for delta in (0.5, 0.01))
+    assert model.logger.name_to_value["ntk/srank"] == expected < default
+
+
+def test_policy_ntk_of_two_environments(monkeypatch):
+    env = make_vec_env(RandomEnv, 2, seed=0)
+    model = PPO("MlpPolicy", env, n_steps=4, batch_size=8, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu").learn(0)
+    model.collect_rollouts(model.env, model._setup_learn(8)[1], model.rollout_buffer, 4)
+    monkeypatch.setattr(np.random, "permutation", np.arange)
+    buffer, policy, vectors = model.rollout_buffer, model.policy, []
+    advantages = (buffer.advantages - buffer.advantages.mean()) / (buffer.advantages.std() + 1e-8)
+    for step, index in np.ndindex(4, 2):
+        observation, action = (th.as_tensor(each[step, index]) for each in (buffer.observations, buffer.actions))
+        objective = policy.evaluate_actions(observation[None], action.long())[1].sum() * float(advantages[step, index])
+        gradients = th.autograd.grad(objective, list(policy.parameters()), allow_unused=True)
+        vectors.append(th.cat([g.flatten() for g in gradients if g is not None]).double())
+    expected = th.stack(vectors) @ th.stack(vectors).T
+    th.testing.assert_close(policy_ntk(model, 8), expected, rtol=1e-4, atol=1e-5 * expected.abs().max().item())
+
+
+def test_q_ntk_is_of_normalised_observations():
+    env, matrices = VecNormalize(make_vec_env(RandomEnv, 1)), []
+    settings = dict(learning_starts=10, policy_kwargs=dict(net_arch=[8]), seed=0, device="cpu")
+    model = DQN("MlpPolicy", env, **settings).learn(40)
+    for shift in (0, 1):
+        env.obs_rms.mean = env.obs_rms.mean + shift
+        np.random.seed(3)
+        matrices.append(q_ntk(model, 7))
+    assert not th.allclose(*matrices)
+
+
+def test_q_ntk_of_quantiles_is_that_of_their_mean():
+    settings = dict(learning_starts=10, policy_kwargs=dict(net_arch=[8], n_quantiles=5), seed=0, device="cpu")
+    model = QRDQN("MlpPolicy", "CartPole-v1", **settings).learn(20)
+    np.random.seed(3)
+    matrix = q_ntk(model, 1)
+    np.random.seed(3)
+    replay = model.replay_buffer._get_samples(np.random.permutation(20)[:1])
+    value = model.quantile_net(replay.observations).mean(dim=1)[0, replay.actions.item()]
+    gradients = th.autograd.grad(value, list(model.quantile_net.parameters()))
+    assert matrix.item() == pytest.approx(sum(g.double().square().sum().item() for g in gradients), rel=1e-4)
+
+
+def test_policy_ntk_has_the_masks():
+    member, seen = FAMILY["MaskablePPO"], []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            policy = self.model.policy
+            evaluate_actions = policy.evaluate_actions
+            policy.evaluate_actions = lambda *args: (seen.append(len(args)), evaluate_actions(*args))[1]
+            policy_ntk(self.model, 4)
+            del policy.evaluate_actions
+
+    member.make(member.stock).learn(32, Look())
+    assert set(seen) == {3}  # observations, actions, masks
+
+
+def test_q_ntk_leaves_batch_norm_alone():
+    policy_kwargs = dict(features_extractor_class=NormalisedExtractor)
+    model = DQN("MlpPolicy", RandomEnv(), learning_starts=10, policy_kwargs=policy_kwargs, seed=0, device="cpu").learn(30)
+    model.policy.set_training_mode(True)
+    before = {name: buffer.clone() for name, buffer in model.q_net.named_buffers()}
+    q_ntk(model, 4)
+    assert before and all(th.equal(buffer, before[name]) for name, buffer in model.q_net.named_buffers())
+    assert model.q_net.training

@@ -404,3 +404,23 @@ def test_maskable_ppo_takes_the_tasks_own_actions_alone():
 def test_spaces_that_do_not_fit(make_env, error, message):
     with pytest.raises(error, match=message):
         make_env()
+
+
+def test_the_friction_of_another_cycle():
+    settings = dict(n_tasks=2, frictions=[1.0, 0.01], steps_per_task=8, blend_steps=4, cycles=2)
+    env = gym.make("Continual/SlipperyAnt-v0", **settings).unwrapped
+    env.set_clock(16)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    assert env.task.unwrapped.model.geom_friction[0, 0] == pytest.approx(1.0)
+
+
+def test_atari_repeats_as_often_as_told():
+    env = gym.make("Continual/Atari-v0", tasks=["Freeway"], repeat_action_probability=0.0).unwrapped
+    assert env.task.spec.kwargs["repeat_action_probability"] == 0.0
+
+
+def test_actions_go_round_and_round():
+    env = CommonSpaces(gym.make("CartPole-v1"), 4, 7, "wrap")
+    assert [int(env._own_action(action)) for action in range(7)] == [0, 1, 0, 1, 0, 1, 0]

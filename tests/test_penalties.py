@@ -173,3 +173,15 @@ def test_parseval_by_hand():
 def test_orthogonal_initialisation_has_no_parseval_loss():
     weight = nn.Parameter(nn.init.orthogonal_(th.empty(6, 6), gain=2**0.5))
     assert Parseval([weight], n_output_layers=0).metrics()["parseval/loss"] < 1e-10
+
+
+def test_parseval_of_another_scale():
+    weight = nn.Parameter(nn.init.orthogonal_(th.empty(6, 6), gain=3.0))
+    assert Parseval([weight], n_output_layers=0, scale=9.0).metrics()["parseval/loss"] < 1e-8
+
+
+def test_penalties_add_up():
+    weight = nn.Parameter(th.tensor([[2.0]]))
+    inside = dict(base_class=Parseval, base_kwargs=dict(coef=1.0, n_output_layers=0))
+    L2Init([weight], coef=0.5, towards="zero", **inside).zero_grad()
+    assert weight.grad.item() == 2 * 0.5 * 2 + 4 * (4 - 2) * 2

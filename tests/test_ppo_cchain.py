@@ -195,3 +195,25 @@ def test_rollout_of_one_minibatch_is_its_own_reference(verbose, n_lines, capsys)
     model.learn(3 * 32)
     assert capsys.readouterr().out.count("32 steps is a single minibatch of batch_size=32") == n_lines
     assert len(model.churn_reducer.coefficient.churn_losses.nonzero()) == 3
+
+
+def test_value_churn_is_of_the_first_update_of_each_epoch_on_32_samples():
+    settings = dict(n_steps=120, batch_size=40, n_epochs=2, learning_rate=1e-2, seed=0, device="cpu")
+    model, before, expected = CChainPPO("MlpPolicy", RandomEnv(), **settings), [], []
+
+    def values(x):
+        return model.policy.predict_values(x).detach()
+
+    def note(*_):
+        x = model.churn_reducer.reference[:32]
+        before.append((x, values(x)))
+
+    def compare(*_):
+        if len(before) % 3 == 1:
+            x, old = before[-1]
+            expected.append((values(x) - old).abs().mean().item())
+
+    model.policy.optimizer.register_step_pre_hook(note)
+    model.policy.optimizer.register_step_post_hook(compare)
+    model.learn(120)
+    assert model.logger.name_to_value["churn/value_churn"] == pytest.approx(np.mean(expected), rel=1e-4)

@@ -435,3 +435,16 @@ def test_the_option_reaches_the_optimiser():
         parameter = model.policy.mlp_extractor.policy_net[0].weight
         assert model.policy.optimizer.state[parameter]["step"] == step
         assert model.policy.optimizer.state[model.policy.value_net.bias]["step"] == 4
+
+
+@pytest.mark.parametrize("name", ["PPO", "DQN"])
+def test_redo_looks_at_a_batch_of_its_size(name):
+    sizes = []
+
+    class Spy(ReDo):
+        def _choose(self, observations):
+            sizes.append(len(observations))
+            return super()._choose(observations)
+
+    make_model(name, env=make_random_env()).learn(32, callback=Spy(interval=1, batch_size=5))
+    assert set(sizes) == {5}

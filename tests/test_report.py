@@ -1165,3 +1165,21 @@ def test_the_committed_results_make_the_committed_reports(tmp_path, monkeypatch)
         assert sorted(path.name for path in (before / "pictures").iterdir()) == [
             Path(name).name for name in names if name.startswith("pictures/")
         ]
+
+
+def test_the_median_recovery_and_the_last_forgetting(tmp_path):
+    metrics = [(step, "continual_eval/forgetting", value) for step, value in ((100, 9.0), (200, 1.0))]
+    write(tmp_path, "vanilla", [[1.0] * 5, [1.0]], metrics=metrics)
+    write(tmp_path, "vanilla", [[1.0] * 5, [1.0]], seed=1)
+    write(tmp_path, "vanilla", [[1.0] * 5, [0.0] * 4 + [1.0]], seed=2)
+    header, _, row = table_rows(continual_table(whole_results(tmp_path), GYM_LINES, 1, own_scales=False))
+    cells = dict(zip(header, row, strict=True))
+    assert (cells["recovered"], cells["steps to recover"], cells["forgetting"]) == ("3 of 3", "60", "1.0")
+
+
+def test_the_best_is_by_the_rule_of_the_paper(tmp_path):
+    for beta, value, cut in ((None, -100, -300), ("1e3", -200, -210)):
+        fields = {} if beta is None else {"variant": f"cchain@{beta}", "overrides": (f"target_churn_ratio:{beta}",)}
+        write_long(tmp_path, "cchain", value, metrics=with_cut(cut), **fields)
+    (best,) = best_strengths("gym_control", cells_in(tmp_path), [ACROBOT])
+    assert best.strength == "1e3" and best.mean("1e4") == -300

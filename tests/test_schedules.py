@@ -182,9 +182,11 @@ def test_an_interrupted_training_leaves_nothing():
 
 
 def test_training_beyond_the_end_is_warned_of():
-    model = make(PPO)
+    # A schedule that does not stay at 0 by itself
+    model = make(PPO, learning_rate=lambda left: 1e-3 * left)
     with pytest.warns(UserWarning, match=r"trains up to step 48, but OverallSchedule has `total_timesteps=32`"):
         assert rates_of(model, OverallSchedule(32), [48])[48] == 0
+    assert model._current_progress_remaining == 0
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, "1e6", None])

@@ -93,3 +93,33 @@ def test_with_the_same_callback_silences_go_on():
         assert snr._n_batches == n_batches
     make_model("PPO", env=make_random_env()).learn(16, callback=snr)
     assert snr._n_batches == 1
+
+
+def test_thresholds_are_updated_in_training(monkeypatch):
+    etas, update = [], Silences.update_thresholds
+    monkeypatch.setattr(Silences, "update_thresholds", lambda self, eta: (etas.append(eta), update(self, eta)))
+    model = make_model(
+        "PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[4], activation_fn=nn.ReLU), learning_rate=0.0
+    )
+    with th.no_grad():
+        for p in model.policy.mlp_extractor.parameters():
+            p.fill_(float(p.dim() == 1))  # all units fire in every batch
+    snr = SelfNormalizedResets(eta=0.3, max_threshold=8, update_interval=2, interval=1)
+    model.learn(48, callback=snr)
+    assert set(etas) == {0.3} and snr._silences[0].thresholds.tolist() == [1] * 4
+
+
+def test_one_observation_is_enough_to_fire():
+    model, snr = (
+        make_model("PPO", env=make_random_env(), policy_kwargs=dict(net_arch=[1], activation_fn=nn.ReLU)),
+        SelfNormalizedResets(),
+    )
+    model.learn(16, callback=snr)
+    with th.no_grad():
+        for p in model.policy.mlp_extractor.parameters():
+            p.fill_(0.0)
+        model.policy.mlp_extractor.policy_net[0].weight[0, 0] = 1.0
+    observations = -th.ones(10, 4)
+    observations[3, 0] = 1.0
+    snr._choose(observations)
+    assert snr._silences[0].ages[0] == 0 and snr._silences[1].ages[0] > 0

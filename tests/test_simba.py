@@ -104,3 +104,9 @@ def test_of_sac(tmp_path, algorithm, net_arch):
 def test_what_it_refuses(name, policy, net_arch):
     with pytest.raises(ValueError, match="`net_arch` must give each network one width or more, all the same"):
         make_model(name, make_random_env(), policy, policy_kwargs=dict(net_arch=net_arch))
+
+
+def test_widths_of_simba_are_the_papers():
+    model = SAC(SimBaSACPolicy, "Pendulum-v1", buffer_size=10, device="cpu")
+    assert model.actor.latent_pi[0].out_features == 128
+    assert [network[0][0].out_features for network in model.critic.q_networks] == [512, 512]

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecChec
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.envs import TaskVecNormalize
 from tests.envs import CountEnv, RandomEnv
+from tests.method_models import OFF_POLICY, make_env
 
 SETTINGS = dict(n_steps=16, batch_size=8, n_epochs=1, device="cpu", seed=0)
 
@@ -363,3 +364,13 @@ def test_environments_whose_task_is_not_told():
     env = TaskVecNormalize(make_vec_env(CountEnv, 2, seed=0))
     play(env, 20)
     assert env.obs_rms.count == pytest.approx(42, abs=1e-3)
+
+
+def test_the_first_transition_after_a_sync_is_of_the_task_that_is_due():
+    envs = [VecNormalize(make_vec_env(make_env, 1)) for _ in range(2)]
+    model = DQN("MlpPolicy", envs[0], device="cpu", seed=0, **OFF_POLICY).learn(40, TaskSync())
+    model.set_env(envs[1])
+    model.learning_starts = 10**6
+    model.replay_buffer.reset()
+    model.learn(1, TaskSync(), reset_num_timesteps=False)
+    assert 1 <= model.replay_buffer.observations[0, 0, 0] <= 1.1

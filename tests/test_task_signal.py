@@ -591,3 +591,7 @@ def test_a_signal_is_kept_out_of_the_continual_environments_clock():
     evaluation = EvalCallback(make_env(), eval_freq=8, n_eval_episodes=1, verbose=0, warn=False)
     make_model("CChainPPO").learn(48, [TaskSignal(switch_every=8), evaluation])
     assert evaluation.eval_env.get_attr("task_id") == [1]
+
+
+def test_delta_reaches_the_detector():
+    assert TaskSignal(drift="adwin", drift_delta=0.3)._detector.delta == 0.3

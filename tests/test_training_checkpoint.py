@@ -1057,3 +1057,9 @@ def test_lambda_of_the_callback_form(tmp_path):
     found, expected = resumed.churn_reducer.coefficient, whole.churn_reducer.coefficient
     assert found.value == expected.value and found.n_seen == expected.n_seen > 4
     assert all(th.equal(found.state_dict()[name], value) for name, value in expected.state_dict().items())
+
+
+def test_resume_from_keeps_the_settings(tmp_path):
+    make().learn(32, TrainingCheckpoint(16, tmp_path, keep=5, exact=False))
+    found = TrainingCheckpoint.resume_from(find_checkpoint(tmp_path))
+    assert (found.save_freq, found.keep, found.exact) == (16, 5, False)

@@ -73,3 +73,11 @@ def test_share():
 def test_share_of_bounds_that_floating_point_numbers_miss():
     layer = nn.Linear(3, 5)
     assert step(layer, clip_ratio=0.7).metrics() == {"weight_clipping/share": 1.0}
+
+
+def test_frozen_parameters_are_not_clipped():
+    weight, frozen = (nn.Parameter(th.full((1, 4), 9.0), requires_grad=trained) for trained in (True, False))
+    optimizer = WeightClipping([weight, frozen], lr=0.0, base_class=th.optim.SGD)
+    weight.grad = th.zeros_like(weight)
+    optimizer.step()
+    assert weight.tolist() == [[0.5] * 4] and frozen.tolist() == [[9.0] * 4]

@@ -13,8 +13,10 @@ import sb3_cchain.zoo.cli as zoo
 import sb3_cchain.zoo.search as search
 import sb3_cchain.zoo.settings
 from sb3_cchain.algorithms import CChainDQN, CChainPPO
+from sb3_cchain.algorithms.churn_targets import KINDS
 from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
+from sb3_cchain.zoo.search import _BETAS
 from tests.zoo_command import FAST, NO_EVALUATION, command
 
 OPTIMIZE = ("-optimize", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots", "--seed", "1")
@@ -245,3 +247,8 @@ def test_a_new_row_trains_and_is_searched(new_row, tmp_path):
         return
     command("train", *options, *OPTIMIZE, "--n-trials", "2")
     assert {float(trial["params_coef"]) for trial in read_report(tmp_path / row.algo)} <= {3.0, 5.0}
+
+
+def test_the_range_of_beta_is_around_the_default():
+    assert {beta for kind in KINDS.values() for t in kind.targets.values() for beta in t.target_ratios.values()} <= set(_BETAS)
+    assert all(low <= beta / 10 and beta * 10 <= high for beta, (low, high) in _BETAS.items())
