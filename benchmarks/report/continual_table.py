@@ -83,4 +83,4 @@ def _areas(runs: Sequence[Result]) -> np.ndarray:
 
 def _text(value: float | np.floating, digits: int) -> str:
     # Without the sign of -0.00
-    return MISSING if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"
+    return MISSING if np.isnan(value) else f"{round(float(value), digits) + 0.0:.{digits}f}"
