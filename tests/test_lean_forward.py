@@ -15,6 +15,7 @@ from torch.nn.modules.module import register_module_forward_hook
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
 from sb3_cchain.networks.lean_forward import LeanForward, has_plain_forward, lean_forward
 from tests.churn_models import ACTION_SPACES, DICT, IMAGE, PPO_SETTINGS, NormalisedExtractor
 from tests.envs import RandomEnv
@@ -241,3 +242,10 @@ def test_copy_of_a_model_in_a_rollout_acts_by_itself():
             parameter.zero_()
         assert policy(th.ones(1, 4))[1] == 0
     assert all(map(th.equal, before, model.policy.parameters()))
+
+
+def test_a_compiled_part_is_no_replaced_method():
+    model = make(algorithm=CChainPPO)
+    assert can_evaluate_jointly(model.policy)
+    model.policy.mlp_extractor.policy_net = th.compile(model.policy.mlp_extractor.policy_net, backend="eager")
+    assert can_evaluate_jointly(model.policy)

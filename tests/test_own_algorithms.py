@@ -3,7 +3,6 @@
 import sys
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -21,15 +20,13 @@ class OwnLoop(PPO):
     """Begins its updates with ``zero_grad()``, and has a loss without the values."""
 
     def train(self):
-        losses = []
         for data in self.rollout_buffer.get(self.batch_size):
             self.policy.optimizer.zero_grad()
             _, log_prob, entropy = self.policy.evaluate_actions(data.observations, data.actions.long().flatten())
             loss = -(data.advantages * th.exp(log_prob - data.old_log_prob)).mean()
             loss.backward()
             self.policy.optimizer.step()
-            losses.append(loss.item())
-        self.logger.record("train/policy_gradient_loss", np.mean(losses))
+            self.logger.record_mean("train/policy_gradient_loss", loss.item())
         self.logger.record("train/entropy_loss", -entropy.mean().item())
 
 

@@ -135,7 +135,7 @@ class Rates:
     def __init__(self, results: Iterable[Result]):
         self._totals: dict[tuple, tuple[int, float]] = {}
         for result in results:
-            if "cuda" in result.command:
+            if any(word.startswith("cuda") for word in result.command):
                 continue
             for key in self._keys(result):
                 steps, seconds = self._totals.get(key, (0, 0.0))

@@ -101,11 +101,13 @@ class ChurnTarget:
     def base_loss(self, model: BaseAlgorithm, logged: Mapping[str, float], without_entropy: bool = False) -> float:
         """
         :param model: A model, right after its ``train()``
-        :param logged: What ``train()`` has logged
+        :param logged: What ``train()`` has given to ``record()``
         :param without_entropy: Whether only the first of the losses counts
         :return: L
         :raises ValueError: When ``train()`` has not logged what L is made of
         """
+        # By `record_mean()`, too, or on a logger that `train()` put in place
+        logged = {**getattr(model.logger, "name_to_value", {}), **logged}
         losses = list(self.losses.items())[:1] if without_entropy else list(self.losses.items())
         missing = [name for name, _ in losses if name not in logged]
         if missing:

@@ -81,6 +81,7 @@ class TrainingHooks:
         :param owner: The model, or an object that it uses
         :param method: Name of one of its methods
         :param function: Called in its place, with a function that calls the method; returns what the method is to return
+        :param innermost: Whether it calls the method itself, and not what else stands in its place already
         """
 
         def call_around(call: Callable[[], Any]) -> Any:

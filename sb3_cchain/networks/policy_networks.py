@@ -121,7 +121,9 @@ def is_instrumented(policy: nn.Module) -> bool:
     :param policy: A policy
     :return: Whether hooks look at its modules, or a method was replaced on one of them, not in its class
     """
-    replaced = any(name in vars(module) for module in policy.modules() for name in _METHODS)
+    # What torch.compile() returns has its own `forward` there
+    modules = [module for module in policy.modules() if not hasattr(module, "_orig_mod")]
+    replaced = any(name in vars(module) for module in modules for name in _METHODS)
     return replaced or any(hooks_of(policy)) or bool(nn.modules.module._has_any_global_hook())
 
 
