@@ -124,7 +124,7 @@ def is_instrumented(policy: nn.Module) -> bool:
     # What torch.compile() returns has its own `forward` there
     modules = [module for module in policy.modules() if not hasattr(module, "_orig_mod")]
     replaced = any(name in vars(module) for module in modules for name in _METHODS)
-    return replaced or any(hooks_of(policy)) or bool(nn.modules.module._has_any_global_hook())
+    return replaced or any(hooks_of(policy))
 
 
 def is_plain(policy: nn.Module) -> bool:
@@ -142,6 +142,7 @@ def is_plain(policy: nn.Module) -> bool:
         and type(policy.mlp_extractor) is MlpExtractor
         and type(policy.mlp_extractor.policy_net) is type(policy.mlp_extractor.value_net) is nn.Sequential
         and not is_instrumented(policy)
+        and not nn.modules.module._has_any_global_hook()  # as those that count operations
     )
 
 
