@@ -75,6 +75,7 @@ NOT_FOR = {
     *((name, "DQN") for name in ("EntropyBonusRestart", "EpisodicRollouts", "RolloutNormalizedAdvantage")),
     *((name, algo) for name in ("EWCConsolidation", "LogStdRestart", "PlasticityInjection") for algo in ("PPO", "DQN")),
 }
+SUITED = sorted((name, algorithm) for name in PUBLIC for algorithm in ("PPO", "DQN") if (name, algorithm) not in NOT_FOR)
 
 
 def attached(model):
@@ -88,12 +89,15 @@ def attached(model):
     return hooks + [name for o in owners if o for name in vars(o) if callable(getattr(type(o), name, None))]
 
 
-@pytest.mark.parametrize("algorithm, where", [("PPO", "update"), ("DQN", "update"), ("PPO", "step")])
-@pytest.mark.parametrize("name", sorted(PUBLIC))
+@pytest.mark.parametrize(
+    "name, algorithm, where",
+    [
+        *((*suited, "update") for suited in SUITED),
+        *((name, algorithm, "step") for name, algorithm in SUITED if algorithm == "PPO"),
+    ],
+)
 def test_training_without_the_callback_is_plain_training(tmp_path, monkeypatch, name, algorithm, where):
     monkeypatch.chdir(tmp_path)
-    if (name, algorithm) in NOT_FOR:
-        pytest.skip(f"{name} is not for {algorithm}")
     settings = dict(normalize_advantage=False) if algorithm == "PPO" else {}
     model = make_model(algorithm, policy_kwargs=dict(net_arch=[8], optimizer_class=methods.L2Init), **settings)
     before = attached(model)
@@ -115,24 +119,31 @@ def test_training_without_the_callback_is_plain_training(tmp_path, monkeypatch, 
     assert attached(model) == before
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
-@pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_the_end_of_training_may_be_told_twice(tmp_path, monkeypatch, name, algorithm):
-    """As RL Zoo does with the first callback, also when training did not start."""
-    monkeypatch.chdir(tmp_path)
+def model_and_callbacks(name, algorithm):
     settings = dict(normalize_advantage=False) if algorithm == "PPO" else {}
     model = make_model(algorithm, policy_kwargs=dict(optimizer_class=methods.L2Init), **settings)
-    callback = make_callback(name)
-    callbacks = [callback, *([] if name == "TaskSync" else [TaskSync()])]
-    if (name, algorithm) in NOT_FOR:
-        with pytest.raises(TypeError, match=r" is for | needs "):
-            model.learn(64, callback=callbacks)
-        callback.on_training_end()
-        return
+    return model, [make_callback(name), *([] if name == "TaskSync" else [TaskSync()])]
+
+
+@pytest.mark.parametrize("name, algorithm", sorted(NOT_FOR))
+def test_the_end_of_a_training_that_was_refused_may_be_told(tmp_path, monkeypatch, name, algorithm):
+    """As RL Zoo does with the first callback."""
+    monkeypatch.chdir(tmp_path)
+    model, callbacks = model_and_callbacks(name, algorithm)
+    with pytest.raises(TypeError, match=rf"^{name} (is for|needs) "):
+        model.learn(64, callback=callbacks)
+    callbacks[0].on_training_end()
+
+
+@pytest.mark.parametrize("name, algorithm", SUITED)
+def test_the_end_of_training_may_be_told_twice(tmp_path, monkeypatch, name, algorithm):
+    """As RL Zoo does with the first callback."""
+    monkeypatch.chdir(tmp_path)
+    model, callbacks = model_and_callbacks(name, algorithm)
     model.learn(64, callback=callbacks)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
     kept = {name: len(value) for name, value in vars(model).items() if isinstance(value, list)}
-    callback.on_training_end()
+    callbacks[0].on_training_end()
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.csv")} == before
     assert {name: len(value) for name, value in vars(model).items() if isinstance(value, list)} == kept
 
