@@ -11,7 +11,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv, TrainingCheckpoint
+from sb3_cchain.envs import CommonSpaces, TaskCaption
 from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
 from tests.envs import RandomEnv
 
@@ -111,5 +112,10 @@ class WithoutOptions(gym.Env):
 
 def test_tasks_whose_reset_takes_no_options(tmp_path):
     env = ContinualEnv([WithoutOptions, WithoutOptions], steps_per_task=64)
-    model = CChainPPO("MlpPolicy", make_vec_env(lambda: env), **PPO_SETTINGS).learn(128)
+    checkpoint = TrainingCheckpoint(32, tmp_path)
+    model = CChainPPO("MlpPolicy", make_vec_env(lambda: env), **PPO_SETTINGS).learn(128, checkpoint)
     assert model.num_timesteps == 128 and env.task_id == 1
+    pictured = WithoutOptions()
+    pictured.render_mode = "rgb_array"
+    assert TaskCaption(pictured).reset()[1] == {}
+    assert CommonSpaces(WithoutOptions(), 4, 2, "wrap").reset()[0].shape == (4,)

@@ -71,16 +71,12 @@ def _goes_jointly(model: Any, policy: ActorCriticPolicy, options: PolicyChurnOpt
     return (
         (options.churn_reference == "next" or not has_convolutions(policy))
         and can_evaluate_jointly(policy)
-        and has_sb3s_train(model)
+        and _has_sb3s_train(model)
     )
 
 
-def has_sb3s_train(model: Any) -> bool:
-    """
-    :param model: A model
-    :return: Whether its ``train()`` is SB3's, by which ``zero_grad()`` comes after the evaluation of a minibatch, and the loss
-        has the values in it
-    """
+def _has_sb3s_train(model: Any) -> bool:
+    """In SB3's, ``zero_grad()`` comes after the evaluation of a minibatch, and the loss has the values in it."""
     classes = [base for base in type(model).__mro__ if "train" in vars(base)]
     return all(base.__module__.startswith(("stable_baselines3.", "sb3_cchain.")) for base in classes)
 

@@ -10,6 +10,7 @@ from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_cchain.checkpoint.object_state import ObjectStates, object_states, restore_objects, stock_class
+from sb3_cchain.envs.reset import reset_env
 
 # How environments and wrappers were made
 CONSTRUCTION = frozenset({"_cached_spec", "_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs", "mujoco_renderer"})
@@ -55,9 +56,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._reset_arguments = {"seed": seed, "options": deepcopy(options)}
         self._actions = []
         self.is_recorded = True
-        # As SB3 does, for environments whose `reset()` takes no options
-        given = {} if options is None else {"options": options}
-        observation, info = self.env.reset(seed=seed, **given)
+        observation, info = reset_env(self.env, seed, options)
         self._observation = observation
         return observation, info
 

@@ -14,6 +14,7 @@ from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
 from sb3_cchain.checkpoint.object_state import NotSaved, ObjectStates, object_states, restore_objects, stock_class
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.envs.reset import reset_env
 
 # As an option of `reset()`, the info of the reset with which the present episode began. See `ResumableEnv.reset`
 RESUMED = "sb3_cchain.resumed_reset_info"
@@ -48,9 +49,7 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         if options is not None and RESUMED in options:
             return None, options[RESUMED]  # type: ignore[return-value]
-        # As SB3 does, for environments whose `reset()` takes no options
-        given = {} if options is None else {"options": options}
-        return self.env.reset(seed=seed, **given)
+        return reset_env(self.env, seed, options)
 
     def state_dict(self) -> ObjectStates:
         """

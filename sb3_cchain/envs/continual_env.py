@@ -6,6 +6,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.core import ActType, ObsType, RenderFrame
 
+from sb3_cchain.envs.reset import reset_env
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.validation import check_list, check_number
 
@@ -153,9 +154,7 @@ class ContinualEnv(gym.Env[ObsType, ActType]):
             seed = int(self.np_random.integers(2**31))
         if self.blend_steps:
             self._drift()
-        # As SB3 does, for tasks whose `reset()` takes no options
-        given = {} if options is None else {"options": options}
-        observation, info = self.task.reset(seed=seed, **given)
+        observation, info = reset_env(self.task, seed, options)
         self._episode_return = 0.0
         return observation, {**info, "task_id": self.task_id}
 

@@ -11,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
+from sb3_cchain.envs.reset import reset_env
 from sb3_cchain.validation import check_choice, check_list, check_number
 
 
@@ -74,7 +75,7 @@ class CommonSpaces(gym.Wrapper, RecordConstructorArgs):
         :param options: Passed on
         :return: Observation and info
         """
-        observation, info = self.env.reset(seed=seed, options=options)
+        observation, info = reset_env(self.env, seed, options)
         return self._padded(observation), info
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:

@@ -9,6 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
+from sb3_cchain.envs.reset import reset_env
 from sb3_cchain.tasks.signal import TASK_KEY
 
 # Of the height of a frame. Smaller letters than of 10 pixels cannot be read
@@ -40,7 +41,7 @@ class TaskCaption(gym.Wrapper[ObsType, ActType, ObsType, ActType], RecordConstru
         :param options: Passed on
         :return: Observation and info
         """
-        observation, info = self.env.reset(seed=seed, options=options)
+        observation, info = reset_env(self.env, seed, options)
         self._task = info.get(self.key)
         return observation, info
 
