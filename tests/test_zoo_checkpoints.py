@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cchain import CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
-from sb3_cchain.checkpoint import saved_timesteps
+from sb3_cchain.checkpoint import resumable_env, saved_timesteps
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
@@ -196,6 +196,7 @@ def test_another_device_is_refused(checkpoints, tmp_path):
         (["--checkpoint-freq", "0"], "--checkpoint-freq must be at least 1; got 0"),
         (["--checkpoint-freq", "8", "--checkpoint-keep", "0"], "--checkpoint-keep must be at least 1; got 0"),
         (["--checkpoint-keep", "2"], "give --checkpoint-freq STEPS, too"),
+        (["--checkpoint-inexact"], "--checkpoint-inexact is about checkpoints: give --checkpoint-freq STEPS, too"),
         (["--checkpoint-freq", "8", "-optimize"], "--checkpoint-freq does not go with -optimize"),
         (["--resume", "{}", "-optimize"], "--resume does not go with -optimize"),
         (["--resume", "{}", "-i", "model.zip"], r"--resume and -i are both given, .* and model.zip: --resume goes on exactly"),
@@ -237,6 +238,17 @@ def test_as_many_checkpoints_stay_as_before(options, kept, tmp_path):
     assert len(list((run_folder(tmp_path, 2) / "checkpoints").glob("step_*"))) == kept
 
 
+@pytest.mark.parametrize("options", [(), ("--vec-env", "subproc")])
+def test_environments_that_cannot_be_resumed_exactly(options, tmp_path, monkeypatch):
+    monkeypatch.setattr(resumable_env, "is_inexact", lambda env: True)
+    train(tmp_path, *options, "--checkpoint-freq", 32, "--checkpoint-inexact", n=96, evaluation=NO_EVALUATION)
+    for number in (1, 2):  # further checkpoints are as the first ones
+        with pytest.warns(UserWarning, match="All environments begin new episodes"):
+            n = 96 * (number + 1)
+            train(tmp_path, *options, "--resume", run_folder(tmp_path, number), n=n, evaluation=NO_EVALUATION)
+        assert saved_timesteps(run_folder(tmp_path, number + 1) / f"{NAME}.zip") == n
+
+
 def test_checkpoints_change_nothing(tmp_path):
     train(tmp_path)
     train(tmp_path, "--checkpoint-freq", 1)
@@ -249,7 +261,7 @@ def test_help_lists_the_options(arguments, capsys):
         command("train", *arguments)
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    for option in ("--checkpoint-freq STEPS", "--checkpoint-keep N", "--resume PATH", "--n-timesteps"):
+    for option in ("--checkpoint-freq STEPS", "--checkpoint-keep N", "--checkpoint-inexact", "--resume PATH", "--n-timesteps"):
         assert option in shown
 
 

@@ -34,6 +34,7 @@ class CheckpointOptions(NamedTuple):
 
     :param freq: Environment steps between two checkpoints, None for as many as in the training that goes on
     :param keep: How many of the newest checkpoints stay, None for as many as in the training that goes on
+    :param exact: Whether environments that cannot be resumed exactly are refused
     :param typed: The other arguments, as typed
     :param resume: Where the checkpoint is that training goes on from, None for training from the start
     :param checkpoint: That checkpoint
@@ -42,6 +43,7 @@ class CheckpointOptions(NamedTuple):
 
     freq: int | None
     keep: int | None
+    exact: bool
     typed: Sequence[str]
     resume: Path | None = None
     checkpoint: Checkpoint | None = None
@@ -81,6 +83,12 @@ def make_parser() -> argparse.ArgumentParser:
         help=f"How many of the newest checkpoints stay (default: {KEEP}; with --resume, as before)",
     )
     group.add_argument(
+        "--checkpoint-inexact",
+        action="store_true",
+        help="Also save training in environments that cannot be resumed exactly, such as Atari games: with --resume, all "
+        "environments begin new episodes",
+    )
+    group.add_argument(
         "--resume",
         type=Path,
         metavar="PATH",
@@ -96,8 +104,9 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
     :return: What these options say, None where none is given; and the arguments for RL Zoo
     :raises SystemExit: When an option is out of range, or the options do not go together
     """
-    given, rest = make_parser().parse_known_args(arguments)
-    if given.checkpoint_freq is None and given.checkpoint_keep is None and given.resume is None:
+    parser = make_parser()
+    given, rest = parser.parse_known_args(arguments)
+    if given == parser.parse_args([]):
         return None, rest
     others = argparse.ArgumentParser(add_help=False)
     others.add_argument("-i", "--trained-agent", default="")
@@ -108,7 +117,8 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
         if value is not None and value < 1:
             sys.exit(f"--{name.replace('_', '-')} must be at least 1; got {value}")
     if given.checkpoint_freq is None and given.resume is None:
-        sys.exit("--checkpoint-keep says how many checkpoints stay: give --checkpoint-freq STEPS, too")
+        option = "--checkpoint-keep" if given.checkpoint_keep is not None else "--checkpoint-inexact"
+        sys.exit(f"{option} is about checkpoints: give --checkpoint-freq STEPS, too")
     if other.optimize_hyperparameters:
         sys.exit(f"{'--checkpoint-freq' if given.resume is None else '--resume'} does not go with -optimize")
     if given.resume is not None and other.trained_agent:
@@ -117,7 +127,7 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
             "checkpoint, -i goes on from a model alone"
         )
     keep = given.checkpoint_keep or (KEEP if given.resume is None else None)
-    return CheckpointOptions(given.checkpoint_freq, keep, rest, given.resume), rest
+    return CheckpointOptions(given.checkpoint_freq, keep, not given.checkpoint_inexact, rest, given.resume), rest
 
 
 def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[CheckpointOptions, list[str]]:
@@ -141,7 +151,8 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
         arguments = [*arguments, "--seed", str(record["options"]["seed"])]
     freq = options.freq or record["checkpoint_freq"]
     keep = options.keep or record.get("checkpoint_keep", KEEP)  # earlier versions did not write it
-    return options._replace(freq=freq, keep=keep, checkpoint=checkpoint, record=record), arguments
+    exact = options.exact and checkpoint.info["training_checkpoint"]["exact"]
+    return options._replace(freq=freq, keep=keep, exact=exact, checkpoint=checkpoint, record=record), arguments
 
 
 def write_record(

@@ -206,7 +206,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     def _make_checkpoint_callback(self, options: CheckpointOptions) -> TrainingCheckpoint:
         assert options.freq is not None and options.keep is not None
-        callback = TrainingCheckpoint(options.freq, self.checkpoint_folder, options.keep)
+        callback = TrainingCheckpoint(options.freq, self.checkpoint_folder, options.keep, options.exact)
         callback.advice = ""  # the summary says how to go on
         if self.resumed is not None:
             callback.go_on_from(self.resumed)
@@ -214,7 +214,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
-        Make the environments. With checkpoints, those in processes of their own are made resumable.
+        Make the environments. With checkpoints that are exact, those in processes of their own are made resumable.
 
         :param n_envs: Number of environments
         :param eval_env: Whether they are for evaluation
@@ -222,7 +222,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         :return: The vectorised environment
         """
         wrapper = self.env_wrapper
-        if self.checkpoints is not None and self.vec_env_class is SubprocVecEnv:
+        if self.checkpoints is not None and self.checkpoints.exact and self.vec_env_class is SubprocVecEnv:
             wrapper = partial(_resumable, wrapper)
         with replaced(self, "env_wrapper", wrapper):
             return super().create_envs(n_envs, eval_env, no_log)
