@@ -112,9 +112,10 @@ class EntropyBonusRestart(TaskBoundary):
     The first task has the model's own, which the model has in rollouts, too: it is raised for ``train()`` only. The step of
     the last switch is kept as ``model.ent_coef_restart``.
 
-    :param ent_coef: The coefficient at the beginning of each later task
+    :param ent_coef: The coefficient at the beginning of each later task, above the model's own
     :param n_steps: Environment steps until it is the model's own again
-    :raises ValueError: Naming the argument that is out of its range
+    :raises ValueError: Naming the argument that is out of its range. When training starts, for an ``ent_coef`` that is not
+        above the model's own
     :raises TypeError: When training starts, for an algorithm that is not on-policy
     """
 
@@ -132,6 +133,11 @@ class EntropyBonusRestart(TaskBoundary):
         # TRPO has the argument of its base class and does not use it
         if not isinstance(self.model, OnPolicyAlgorithm) or is_trpo(self.model):
             raise TypeError(f"EntropyBonusRestart is for PPO and A2C, got {type(self.model).__name__}")
+        if self.ent_coef <= self.model.ent_coef:
+            raise ValueError(
+                f"EntropyBonusRestart raises `ent_coef`: give one above the model's own, {self.model.ent_coef}; "
+                f"got {self.ent_coef}"
+            )
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
