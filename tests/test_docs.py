@@ -145,7 +145,7 @@ def test_the_quickstart_goes_on_where_the_model_was(short_rollouts):
     for code in snippets(ROOT / "docs" / "quickstart.md", "python"):
         exec(shorten(code), names)
     assert names["model"].num_timesteps == 512
-    assert list(short_rollouts.glob("runs/CChainPPO_1/events*")) and (short_rollouts / "acrobot.zip").exists()
+    assert list(short_rollouts.glob("runs/quickstart/CChainPPO_1/events*")) and (short_rollouts / "acrobot.zip").exists()
 
 
 YAML = [pytest.param(code, id=f"{name_of(page)}-{i}") for page in PAGES for i, code in enumerate(snippets(page, "yaml"))]
