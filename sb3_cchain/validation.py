@@ -38,11 +38,11 @@ def check_number(
     ):
         return
     expected = "an integer" if integer else "a number"
-    lower = f"greater than {minimum:g}" if exclusive else f"greater than or equal to {minimum:g}"
+    lower = f"greater than {minimum:.12g}" if exclusive else f"greater than or equal to {minimum:.12g}"
     if math.isfinite(below):
-        expected += f" {lower} and less than {below:g}"
+        expected += f" {lower} and less than {below:.12g}"
     elif math.isfinite(maximum):
-        expected += f" {lower} and at most {maximum:g}" if exclusive else f" between {minimum:g} and {maximum:g}"
+        expected += f" {lower} and at most {maximum:.12g}" if exclusive else f" between {minimum:.12g} and {maximum:.12g}"
     elif math.isfinite(minimum):
         expected += f" {lower}"
     raise ValueError(f"`{name}` must be {expected}, got {value!r}")

@@ -18,7 +18,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
-from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, DoubleDQN, TrainingCheckpoint, resume
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, DoubleDQN, TrainingCheckpoint, resume
 from sb3_cchain.algorithms.contrib import CChainTQC
 from sb3_cchain.analysis import Doctor, remedies
 from sb3_cchain.analysis import doctor as doctor_module
@@ -29,7 +29,9 @@ from sb3_cchain.analysis.remedies import Remedy
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.analysis.symptoms import network_symptoms, note_gradients, policy_change, value_symptoms
+from sb3_cchain.methods import TRAC, UPGD, L2Init, WeightClipping
 from sb3_cchain.methods.registry import METHOD_NAMES
+from sb3_cchain.networks import CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
 from tests.envs import CountEnv, RandomEnv
 from tests.resume_cases import Stop, Stopped
 from tests.test_docs import ROOT
@@ -328,6 +330,13 @@ BY_CLASS_NAME = {
 }
 
 
+def optimised_by(*classes):
+    """For each class a model whose optimiser is of it, within another one."""
+    for cls in classes:
+        arguments = dict(optimizer_class=UPGD, optimizer_kwargs=dict(base_class=cls))
+        yield partial(make, PPO, policy_kwargs={**NET, **arguments})
+
+
 def test_all_remedies_are_used_and_each_finding_has_one_for_each_kind_of_algorithm():
     used = {remedy for check in CHECKS for remedy in check.remedies}
     assert used == set(REMEDIES.values())
@@ -362,6 +371,15 @@ def test_the_lines_of_remedies_run(name):
         ("EPSILON", partial(make, DQN, exploration_final_eps=0.0), partial(make, DQN)),
         ("VALUE_COEF", partial(make, PPO, vf_coef=0.0), partial(make, PPO)),
         ("SLOW_TARGET", partial(make, TD3, tau=1.0), partial(make, TD3)),
+        ("NORMALIZE", partial(make, PPO), partial(make, PPO, DICT)),  # a part of which is discrete
+        ("CCHAIN", partial(make, PPO), partial(make, CChainPPO)),
+        ("CCHAIN", partial(make, PPO), lambda: make(PPO).learn(8, CChainCallback())),
+        ("DOUBLE_DQN", partial(make, DoubleDQN, double_q=False), partial(make, DoubleDQN)),
+        ("LAYER_NORM", partial(make, PPO), partial(make, PPO, policy=LayerNormPolicy)),
+        ("LAYER_NORM_DQN", partial(make, DQN), partial(make, DQN, policy=LayerNormDQNPolicy)),
+        ("CRELU", partial(make, PPO), partial(make, PPO, policy=CReLUPolicy)),
+        ("L2_INIT", *optimised_by(TRAC, L2Init)),
+        ("CLIPPING", *optimised_by(L2Init, WeightClipping)),
     ],
 )
 def test_nothing_is_proposed_that_is_there(name, model, other):

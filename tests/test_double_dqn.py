@@ -347,20 +347,17 @@ def test_continual_environment_brings_its_callbacks():
 )
 def test_other_actions_are_refused(cls, action_space):
     """With the kind of error that SB3 raises."""
-    message = f"{cls.__name__} needs an environment with Discrete actions, got {type(action_space).__name__}"
-    with pytest.raises(AssertionError, match=message):
+    with pytest.raises(AssertionError, match=f"only supports .*Discrete.* as action spaces but {type(action_space).__name__}"):
         cls("MlpPolicy", RandomEnv(action_space=action_space))
-    with pytest.raises(AssertionError, match="Discrete actions, got Box"):
-        cls("MlpPolicy", "Pendulum-v1")
 
 
 @pytest.mark.parametrize("cls", [DoubleDQN, CChainDQN])
 @pytest.mark.parametrize(
     "arguments, error, message",
     [
-        ({"loss": "mae"}, ValueError, """`loss` must be "huber" or "mse", got 'mae'"""),
-        ({"loss": ["mse"]}, ValueError, r"""`loss` must be "huber" or "mse", got \['mse'\]"""),
-        ({"loss": None}, ValueError, """`loss` must be "huber" or "mse", got None"""),
+        ({"loss": "mae"}, ValueError, """`loss` must be one of 'huber', 'mse', got 'mae'"""),
+        ({"loss": ["mse"]}, ValueError, r"""`loss` must be one of 'huber', 'mse', got \['mse'\]"""),
+        ({"loss": None}, ValueError, """`loss` must be one of 'huber', 'mse', got None"""),
         ({"double_q": "yes"}, TypeError, "`double_q` must be True or False, got 'yes'"),
     ],
 )
@@ -370,7 +367,7 @@ def test_bad_arguments(cls, arguments, error, message):
 
 
 def test_n_step_returns_of_dict_observations_are_refused():
-    with pytest.raises(ValueError, match="`n_steps=1`, got 3"):
+    with pytest.raises(AssertionError, match="N-step returns are not supported for Dict observation spaces"):
         DoubleDQN("MultiInputPolicy", RandomEnv(DICT), n_steps=3)
 
 

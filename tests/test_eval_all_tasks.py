@@ -63,6 +63,15 @@ def test_at_intervals(tmp_path):
     assert [row["trained_task"] for row in rows[::3]] == [0, 0, 0, 1, 1, 2, 2]
 
 
+def test_training_that_ends_in_a_rollout_with_two_tasks(tmp_path):
+    """The task that has just begun was not trained on yet, but for that rollout."""
+    arguments = dict(ARGUMENTS, n_steps=20, batch_size=10)
+    model = CChainPPO("MlpPolicy", tasks(), **arguments)
+    model.learn(80, callback=EvalAllTasks(tasks(), path=tmp_path / "all.csv", n_eval_episodes=1))
+    rows = read_task_returns(tmp_path / "all.csv")
+    assert [(row["timesteps"], row["trained_task"]) for row in rows[::3]] == [(0, 0), (40, 0), (80, 1)]
+
+
 def test_cycles_are_evaluated_once(tmp_path):
     env, eval_env = tasks(cycles=2), tasks(cycles=2)
     _, rows = evaluate(tmp_path / "all.csv", total=192, env=env, eval_env=eval_env)

@@ -169,7 +169,7 @@ def test_other_algorithms_are_refused(make, model, message):
 
 
 def test_an_entropy_bonus_that_would_not_rise_is_refused():
-    with pytest.raises(ValueError, match="give one above the model's own, 0.1; got 0.1"):
+    with pytest.raises(ValueError, match=r"give one above the model's own, 0\.1; got 0\.1"):
         make_model("PPO", CountEnv(), ent_coef=0.1).learn(8, [TaskSignal(), EntropyBonusRestart(0.1)])
 
 

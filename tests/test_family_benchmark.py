@@ -143,7 +143,7 @@ def test_a_table_of_falls(runs):
     assert table.endswith("Seeds that are not done yet: PPO: 1; C-CHAIN: 1.")
 
 
-@pytest.mark.parametrize("value, text", [(-181.3, "-181"), (1234.5, "1234"), (23.45, "23.4"), (0.984, "0.98")])
+@pytest.mark.parametrize("value, text", [(-181.3, "-181"), (1234.5, "1234"), (23.45, "23.4"), (0.984, "0.98"), (99.96, "100")])
 def test_numbers(value, text):
     assert number(value) == text
 

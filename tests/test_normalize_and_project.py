@@ -65,12 +65,15 @@ def test_the_initial_norms_hold_also_after_loading(tmp_path, name):
 
 
 def test_what_it_refuses():
-    parameters = [nn.Parameter(th.ones(2, 2))]
+    parameters = [nn.Parameter(th.ones(2, 2)) for _ in range(3)]
     for arguments in (dict(n_output_layers=-1), dict(n_output_layers=0, interval=0), dict(n_output_layers=0, interval=1.5)):
         with pytest.raises(ValueError, match=r"`(n_output_layers|interval)` must be an integer"):
             NormalizeAndProject(parameters, **arguments)
-    with pytest.raises(ValueError, match="`n_output_layers` must leave a weight matrix to project, got 1"):
-        NormalizeAndProject(parameters, n_output_layers=1)
+    for n_output_layers in (3, 4, 5):
+        with pytest.raises(
+            ValueError, match=f"`n_output_layers` must leave a weight matrix to project, got {n_output_layers}"
+        ):
+            NormalizeAndProject(parameters, n_output_layers=n_output_layers)
 
 
 def test_convolutions_are_projected():

@@ -369,6 +369,8 @@ def test_maskable_ppo_takes_the_tasks_own_actions_alone():
     "make_env, error, message",
     [
         (lambda: CommonSpaces(CountEnv(), 0, 2), ValueError, "`observation_size` must be an integer .* got 0"),
+        (lambda: ContinualSequence(observation_size=0), ValueError, "`observation_size` must be an integer .* got 0"),
+        (lambda: ContinualSequence(n_actions=0), ValueError, "`n_actions` must be an integer .* got 0"),
         (
             lambda: CommonSpaces(gym.make("CartPole-v1"), 3, 2),
             ValueError,

@@ -67,6 +67,15 @@ def test_counts_updates(name, n_steps, n_updates, interval, draws):
     assert callback.n_steps == n_updates // interval
 
 
+def test_the_interval_goes_on_in_further_calls_of_learn(draws):
+    callback, model = ShrinkAndPerturb(interval=5), make_model("PPO", env=make_random_env())
+    for _ in range(3):  # of 4 updates each
+        model.learn(16, callback=callback, reset_num_timesteps=False)
+    assert len(draws) == 12 // 5
+    model.learn(48, callback=callback)  # a training of its own
+    assert len(draws) == 2 * (12 // 5)
+
+
 def test_after_each_update_by_hand(draws):
     model = make_model("PPO", env=make_random_env(), n_epochs=1)
     model.lr_schedule = lambda _: 0.0

@@ -498,6 +498,7 @@ def test_river_is_asked_for(monkeypatch):
         (dict(switch_at=7), TypeError, "`switch_at` must be a list of environment steps, got 7"),
         (dict(switch_at=[0]), ValueError, r"`switch_at\[0\]` must be an integer greater than or equal to 1, got 0"),
         (dict(switch_at=[5, 5]), ValueError, r"`switch_at\[1\]` must be an integer greater than or equal to 6, got 5"),
+        (dict(switch_at=[1_000_000] * 2), ValueError, "greater than or equal to 1000001, got 1000000"),
         (dict(drift="page"), ValueError, "`drift` must be one of 'adwin', got 'page'"),
         *(
             (dict(drift="adwin", drift_delta=delta), ValueError, "must be a number greater than 0 and less than 1, got")

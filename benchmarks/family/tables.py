@@ -196,7 +196,7 @@ def falls_table(case: Case, evaluations: Evaluations) -> str:
 def number(value: float) -> str:
     """
     :param value: A score
-    :return: It with three digits or, from 1000 on, as a whole number
+    :return: It with three digits; from 100 on, as a whole number
     """
-    decimals = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
+    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
     return f"{value:.{decimals}f}"

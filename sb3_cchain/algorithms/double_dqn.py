@@ -7,9 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import DQN
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples
 from stable_baselines3.dqn.policies import DQNPolicy
@@ -21,7 +19,7 @@ from sb3_cchain.checkpoint import TrainingCheckpoint
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.policy_outputs import has_training_mode
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
-from sb3_cchain.validation import check_bool
+from sb3_cchain.validation import check_bool, check_choice
 
 SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 
@@ -44,7 +42,7 @@ class DoubleDQN(ZeroRateWarning, DQN):
     :param double_q: Whether to use Double Q-learning; with ``False`` and ``loss="huber"`` it is SB3's DQN, to the bit
     :param loss: Loss of the TD error: ``"huber"`` as SB3, or ``"mse"`` as the C-CHAIN paper's Double DQN
     :param kwargs: Further keyword arguments of DQN
-    :raises ValueError: For a ``loss`` that is neither, or n-step returns with ``Dict`` observations
+    :raises ValueError: For a ``loss`` that is neither
     :raises TypeError: When ``double_q`` is not a boolean
     :raises AssertionError: When the actions are not ``Discrete``, as SB3's DQN
     """
@@ -61,25 +59,14 @@ class DoubleDQN(ZeroRateWarning, DQN):
         self.double_q = double_q
         self.loss = loss
         self._check_arguments()  # before an environment is made
-        if env is not None:  # it is None when a model is loaded without an environment
-            env = maybe_make_env(env, kwargs.get("verbose", 0))
-            if not isinstance(env.action_space, spaces.Discrete):
-                raise AssertionError(
-                    f"{type(self).__name__} needs an environment with Discrete actions, got {env.action_space}"
-                )
         super().__init__(policy, env, *args, **kwargs)
 
     def _check_arguments(self) -> None:
         check_bool("double_q", self.double_q)
-        if self.loss not in tuple(LOSSES):
-            raise ValueError(f'`loss` must be "huber" or "mse", got {self.loss!r}')
+        check_choice("loss", self.loss, tuple(LOSSES))
 
     def _setup_model(self) -> None:
         self._check_arguments()  # again, because `load()` may have changed them
-        if self.n_steps > 1 and self.replay_buffer_class is None and isinstance(self.observation_space, spaces.Dict):
-            raise ValueError(
-                f"SB3 does not support n-step returns for Dict observations yet: set `n_steps=1`, got {self.n_steps!r}"
-            )
         super()._setup_model()
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:

@@ -9,6 +9,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
+from sb3_cchain.networks import CReLU
+from sb3_cchain.networks.model_optimizers import model_optimizers
+
 # By the names of the classes, as sb3-contrib need not be installed. A subclass of one of them counts as that one
 PLAIN_ON_POLICY = ("PPO", "A2C")
 PPO_LIKE = ("PPO", "MaskablePPO", "RecurrentPPO")
@@ -24,8 +27,37 @@ def _always(model: Any) -> bool:
     return True
 
 
-def _is_not_normalized(model: Any) -> bool:
-    return model.get_vec_normalize_env() is None
+def _can_be_normalized(model: Any) -> bool:
+    space = model.observation_space
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    return model.get_vec_normalize_env() is None and all(isinstance(part, spaces.Box) for part in parts)
+
+
+def _has_no_churn_reduction(model: Any) -> bool:
+    return not hasattr(model, "churn_state")
+
+
+def _has_no_double_q(model: Any) -> bool:
+    return not getattr(model, "double_q", False)
+
+
+def _has_no_layer(kind: type[nn.Module]) -> Callable[[Any], bool]:
+    return lambda model: not any(isinstance(module, kind) for module in model.policy.modules())
+
+
+def _has_no_optimizer(name: str) -> Callable[[Any], bool]:
+    return lambda model: name not in _names_of_optimizers(model)
+
+
+def _names_of_optimizers(model: Any) -> set[str]:
+    """With those inside of others."""
+    names = set()
+    for optimizer in model_optimizers(model).values():
+        inner: Any = optimizer
+        while inner is not None:
+            names.add(type(inner).__name__)
+            inner = getattr(inner, "base", None)
+    return names
 
 
 def _has_units_that_saturate(model: Any) -> bool:
@@ -123,7 +155,7 @@ TARGET_KL = Remedy("a limit on the size of updates", _setting("target_kl=0.02"),
 NORMALIZE = Remedy(
     "normalised observations and rewards",
     'from stable_baselines3.common.vec_env import VecNormalize\nmodel = {algorithm}("{policy}", VecNormalize(model.env))',
-    is_new=_is_not_normalized,
+    is_new=_can_be_normalized,
 )
 ENTROPY_BONUS = Remedy("an entropy bonus", _setting("ent_coef=0.01"), WITH_ENTROPY_BONUS, is_new=_has_small_entropy_bonus)
 ENTROPY_TARGET = Remedy(
@@ -169,30 +201,42 @@ LAYER_RESET = Remedy(
 FIRE = Remedy(
     "FIRE, which makes the weights orthogonal", _callback("FIRE", "interval=40_000"), (*PLAIN_ON_POLICY, "DQN"), method="fire"
 )
-CCHAIN = Remedy("churn reduction", _callback("CChainCallback", package="sb3_cchain"), method="cchain")
+CCHAIN = Remedy(
+    *("churn reduction", _callback("CChainCallback", package="sb3_cchain")),
+    method="cchain",
+    is_new=_has_no_churn_reduction,
+)
 LAYER_NORM = Remedy(
     "LayerNorm",
     "from sb3_cchain.networks import LayerNormPolicy\nmodel = {algorithm}(LayerNormPolicy, env)",
     PLAIN_ON_POLICY,
     method="layer_norm",
+    is_new=_has_no_layer(nn.LayerNorm),
 )
 LAYER_NORM_DQN = Remedy(
     "LayerNorm",
     "from sb3_cchain.networks import LayerNormDQNPolicy\nmodel = {algorithm}(LayerNormDQNPolicy, env)",
     ("DQN",),
     method="layer_norm",
+    is_new=_has_no_layer(nn.LayerNorm),
 )
 CRELU = Remedy(
     "CReLU, which has no dead units",
     "from sb3_cchain.networks import CReLUPolicy\nmodel = {algorithm}(CReLUPolicy, env)",
     PLAIN_ON_POLICY,
     method="crelu",
+    is_new=_has_no_layer(CReLU),
 )
-CLIPPING = Remedy("weight clipping", _optimizer("WeightClipping"), method="weight_clipping")
-L2_INIT = Remedy("L2 Init", _optimizer("L2Init", "coef=1e-3"), method="l2_init")
+CLIPPING = Remedy(
+    *("weight clipping", _optimizer("WeightClipping")),
+    method="weight_clipping",
+    is_new=_has_no_optimizer("WeightClipping"),
+)
+L2_INIT = Remedy("L2 Init", _optimizer("L2Init", "coef=1e-3"), method="l2_init", is_new=_has_no_optimizer("L2Init"))
 DOUBLE_DQN = Remedy(
     "Double Q-learning",
     'from sb3_cchain import DoubleDQN\nmodel = DoubleDQN("{policy}", env)',
     ("DQN",),
     method="vanilla",
+    is_new=_has_no_double_q,
 )

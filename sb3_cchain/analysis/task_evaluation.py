@@ -118,7 +118,7 @@ class TaskEvaluation(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        self._trained_task = self.locals["infos"][0][TASK_KEY]
+        self._trained_task = self._switch.task_id  # the task that the rollout began in
 
     def _on_training_end(self) -> None:
         if self._trained_task is not None:

@@ -138,8 +138,10 @@ class ContinualSequence(ContinualEnv[NDArray[np.float32], Any]):
         self.env_ids = check_list("env_ids", env_ids, of="environment ids")
         if observation_size is None or n_actions is None:
             sizes = [_sizes(env_id) for env_id in self.env_ids]
-            observation_size = observation_size or max((size for size, _ in sizes), default=1)
-            n_actions = n_actions or max((number for _, number in sizes), default=1)
+            if observation_size is None:
+                observation_size = max((size for size, _ in sizes), default=1)
+            if n_actions is None:
+                n_actions = max((number for _, number in sizes), default=1)
         makers = [partial(_make_task, env_id, observation_size, n_actions, extra_actions) for env_id in self.env_ids]
         super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
 

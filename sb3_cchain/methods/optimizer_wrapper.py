@@ -35,8 +35,8 @@ class OptimizerWrapper(th.optim.Optimizer):
     :raises ValueError: When a wrapper is nested in another one of its kind
     """
 
-    # Key in the state, and prefix in the log
-    name: ClassVar[str]
+    # Key in the state, and prefix in the log. Each kind has its own
+    name: ClassVar[str] = "optimizer_wrapper"
     # Whether there are `base_class` and `base_kwargs`
     has_arguments_of_base: ClassVar[bool] = True
 
@@ -97,7 +97,7 @@ class OptimizerWrapper(th.optim.Optimizer):
         :return: The parameters that are weight matrices, or of convolutions, in order
         """
         weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
-        return weights[: len(weights) - n_output_layers]
+        return weights[: max(len(weights) - n_output_layers, 0)]
 
     def reference(self) -> list[th.Tensor]:
         """

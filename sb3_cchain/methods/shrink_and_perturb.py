@@ -51,6 +51,7 @@ class ShrinkAndPerturb(TaskBoundary):
             check_number("interval", interval, 1, integer=True)
         self.shrink = shrink
         self.interval = interval
+        self._n_updates = 0
         self._hooks = TrainingHooks()
 
     def _init_callback(self) -> None:
@@ -62,7 +63,8 @@ class ShrinkAndPerturb(TaskBoundary):
         if self.interval is None:
             super()._on_training_start()
         else:
-            self._n_updates = 0
+            if self.num_timesteps == 0:
+                self._n_updates = 0
             self._hooks.after_step(self.model.policy.optimizer, self._after_update)
 
     def _on_training_end(self) -> None:
@@ -77,9 +79,6 @@ class ShrinkAndPerturb(TaskBoundary):
     def _on_rollout_start(self) -> None:
         if self.interval is None:
             super()._on_rollout_start()
-
-    def _on_step(self) -> bool:
-        return self.interval is not None or super()._on_step()
 
     def _on_task_switch(self) -> None:
         self._shrink_and_perturb()
