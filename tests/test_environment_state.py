@@ -363,6 +363,29 @@ class Chaotic(Opaque):
         return np.random.default_rng().random(4, dtype=np.float32), *rest
 
 
+class Bonus(Opaque):
+    """With a reward that the next reset, too, takes from what cannot be saved."""
+
+    bonuses = None
+
+    def reset(self, **kwargs):
+        self.bonuses = self.bonuses or (float(number) for number in range(100))
+        self.bonus = next(self.bonuses)
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, self.bonus, *rest
+
+
+class GlobalNumbers(RandomEnv):
+    """Draws from NumPy's global generator."""
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return np.random.normal(size=4).astype(np.float32), *rest
+
+
 @pytest.mark.parametrize("wrapper", [None, ResumableEnv])
 def test_an_environment_that_cannot_be_saved_is_played_again(wrapper):
     check_cuts(*(begin(make_vec_env(Opaque, 2, seed, wrapper_class=wrapper)) for seed in range(2)), cuts=CUTS)
@@ -373,6 +396,32 @@ def test_an_environment_that_is_not_deterministic():
     play(env, range(3))
     with pytest.raises(ValueError, match=r"environment 0, 0 \w+: .*Chaotic.* 3 steps went otherwise .* not deterministic"):
         restore_environment(new, environment_state(env))
+
+
+def test_an_episode_with_other_rewards_went_otherwise():
+    env, new = (begin(DummyVecEnv([Bonus])) for _ in range(2))
+    play(env, range(22))  # to the third episode
+    with pytest.raises(ValueError, match=r"Bonus.* 2 steps went otherwise"):
+        restore_environment(new, environment_state(env))
+
+
+def test_global_random_numbers_of_other_processes():
+    env, new = (
+        begin(
+            make_vec_env(
+                *(GlobalNumbers, 2, seed),
+                vec_env_cls=SubprocVecEnv,
+                vec_env_kwargs={"start_method": "forkserver"},
+                wrapper_class=ResumableEnv,
+            )
+        )
+        for seed in range(2)
+    )
+    play(env, range(3))
+    restore_environment(new, environment_state(env))
+    assert_same(play(env, range(15)), play(new, range(15)))
+    env.close()
+    new.close()
 
 
 def test_functions_of_wrappers_are_no_obstacle():

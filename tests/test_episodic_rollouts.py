@@ -3,10 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_cchain import ContinualMetrics, TaskSignal
 from sb3_cchain.callbacks import EpisodicRollouts
 from sb3_cchain.callbacks.episodic_rollouts import discounted_returns
 from sb3_cchain.envs import RewardScale
@@ -48,6 +52,36 @@ def test_rollouts(n_envs=2):
         assert np.allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-5)
         assert returns[:7, 0].tolist() == [7, 6, 5, 4, 3, 2, 1]
         assert np.allclose(np.diff(returns[7:, 0]), -1)  # and then the value of the last observation
+
+
+class Masked(CountEnv):
+    def action_masks(self):
+        return np.ones(2, bool)
+
+
+def test_the_last_value_is_that_of_the_last_observation():
+    """With sb3-contrib, too, whose callbacks are not told that value."""
+    targets = []
+    for algorithm, env in ((PPO, CountEnv()), (MaskablePPO, Masked())):
+        spy = Spy()
+        model = algorithm("MlpPolicy", env, n_steps=10, batch_size=5, normalize_advantage=False, device="cpu", seed=0)
+        model.policy.load_state_dict({name: th.full_like(value, 0.1) for name, value in model.policy.state_dict().items()})
+        model.learn(10, [EpisodicRollouts(), spy])
+        targets.append(spy.rollouts[0][2])
+    assert np.array_equal(*targets) and targets[0][9, 0] != pytest.approx(1, abs=0.1)
+
+
+def test_recurrent_policies_are_refused():
+    with pytest.raises(TypeError, match="EpisodicRollouts does not know recurrent networks, got RecurrentPPO"):
+        RecurrentPPO("MlpLstmPolicy", CountEnv(), normalize_advantage=False).learn(8, EpisodicRollouts())
+
+
+def test_returns_of_dropped_episodes_do_not_go_on():
+    """Episodes of 7 steps, of which each rollout drops the last 3; nobody else counts them."""
+    model = PPO("MlpPolicy", CountEnv(), n_steps=10, batch_size=5, normalize_advantage=False, device="cpu", seed=0)
+    model.set_env(DummyVecEnv([CountEnv]))
+    model.learn(40, [TaskSignal(), ContinualMetrics(), EpisodicRollouts()])
+    assert [row["mean_return"] for row in model.continual_returns] == [7.0] * 4
 
 
 def test_the_score_counts_the_episode_that_the_rollout_cuts():

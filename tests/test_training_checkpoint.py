@@ -1,6 +1,7 @@
 """Files and errors of TrainingCheckpoint, and what its signals do. That training goes on exactly is in ``test_resume.py``."""
 
 import csv
+import errno
 import json
 import multiprocessing
 import os
@@ -8,6 +9,7 @@ import random
 import re
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -216,6 +218,57 @@ def test_arguments_that_a_callback_changes_go_on(tmp_path):
     assert callback.rate == 2.0**-10 and callback.log_path == "second"
 
 
+class Level:
+    """Of this module, as the callback that has it."""
+
+    def __init__(self):
+        self.number = 0
+
+
+class Leveller(BaseCallback):
+    """Has an object, and another callback, that it was given."""
+
+    def __init__(self, level, inner=None):
+        super().__init__()
+        self.level, self.inner = level, inner
+
+    def _init_callback(self):
+        self.inner.init_callback(self.model)
+
+    def _on_step(self):
+        self.inner.on_step()
+        return True
+
+    def _on_rollout_end(self):
+        self.level.number += 1
+
+
+def test_objects_that_a_callback_was_given_go_on(tmp_path):
+    train(make(), tmp_path, Leveller(Level(), Decay(1.0, "first")))
+    level, inner = Level(), Decay(1.0, "second")
+    go_on(tmp_path, Leveller(level, inner))
+    assert level.number == 10 and inner.n_calls == STEPS
+
+
+class Late(BaseCallback):
+    """Sets an attribute that is named like an argument."""
+
+    def __init__(self, best=None, interval=None):
+        super().__init__()
+        self.best, self.interval = best, interval
+
+    def _on_step(self):
+        self.best = max(self.best or 0, self.num_timesteps if self.num_timesteps < 50 else 0)
+        return True
+
+
+def test_arguments_that_were_none(tmp_path):
+    train(make(), tmp_path, Late())
+    callback = Late(interval=5)
+    go_on(tmp_path, callback)
+    assert (callback.best, callback.interval) == (49, 5)
+
+
 def test_training_with_it_is_training_without_it(tmp_path):
     for create in (make, make_dqn):
         models = []
@@ -265,21 +318,54 @@ def test_what_was_not_saved_is_named(tmp_path):
     assert "callback 1.process_of_another_package" in find_checkpoint(tmp_path).info["left_out"]
 
 
-def test_a_checkpoint_that_cannot_be_written(tmp_path, monkeypatch, handlers):
+@pytest.fixture
+def full_disk(monkeypatch):
+    """From a step on, for some steps."""
+
+    def fill(first, last):
+        rename = os.rename
+
+        def full(source, target):
+            if f"step_{first:012d}" <= Path(target).name <= f"step_{last:012d}":
+                raise OSError("No space left on device")
+            rename(source, target)
+
+        monkeypatch.setattr(os, "rename", full)
+
+    return fill
+
+
+def test_a_checkpoint_that_cannot_be_written_is_tried_again(tmp_path, full_disk):
+    full_disk(96, 112)
+    with pytest.warns(
+        UserWarning, match="No checkpoint was saved at step .*: No space left.*the next rollout tries again"
+    ) as all_:
+        model = make().learn(STEPS, TrainingCheckpoint(32, tmp_path, keep=9))
+    assert [re.search(r"step (\d+)", str(warning.message))[1] for warning in all_] == ["96", "112"]
+    assert names(tmp_path) == [f"step_{number:012d}" for number in (32, 64, 128)]
+    assert_same(model, make().learn(STEPS))
+
+
+def test_the_last_checkpoint_cannot_be_written(tmp_path, full_disk, handlers):
     """An error, which leaves the checkpoints that are there."""
-    rename, model = os.rename, make()
-
-    def full(source, target):
-        if Path(target).name == f"step_{NEWEST:012d}":
-            raise OSError("No space left on device")
-        rename(source, target)
-
-    monkeypatch.setattr(os, "rename", full)
+    full_disk(NEWEST, STEPS)
     with pytest.raises(OSError, match="No space left"):
-        model.learn(STEPS, TrainingCheckpoint(32, tmp_path))
-    monkeypatch.undo()
-    assert find_checkpoint(tmp_path).num_timesteps == BEFORE and len(names(tmp_path)) == 2
-    assert_same(resume(tmp_path, make_env(), device="cpu"), make().learn(STEPS))
+        make().learn(STEPS, [TrainingCheckpoint(64, tmp_path), Send((90, signal.SIGINT))])
+    assert find_checkpoint(tmp_path).num_timesteps == BEFORE and len(names(tmp_path)) == 1
+
+
+def test_folders_that_cannot_be_synchronised(tmp_path, monkeypatch):
+    """As some network file systems have them."""
+    fsync = os.fsync
+
+    def for_files_only(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", for_files_only)
+    train(make(), tmp_path)
+    assert find_checkpoint(tmp_path).num_timesteps == NEWEST
 
 
 @pytest.mark.parametrize("algorithm", [PPO, CChainPPO])
@@ -587,8 +673,12 @@ class Changed(gym.Wrapper):
     [
         (dict(n_envs=2), "number of environments was 1 and is 2"),
         (dict(wrapper_class=Changed), r"environment was CartPole-v1 \(.*\) and is CartPole-v1 \(Changed "),
+        (
+            dict(env_kwargs=dict(sutton_barto_reward=True, render_mode="rgb_array")),
+            r"environment was CartPole-v1 \(.*\) and is CartPole-v1 with sutton_barto_reward=True \(",
+        ),
     ],
-    ids=["number", "wrappers"],
+    ids=["number", "wrappers", "arguments"],
 )
 def test_another_environment(path, kwargs, message):
     before = names(path)
@@ -845,6 +935,13 @@ def test_a_signal_saves_and_stops(tmp_path, capsys, handlers, create, number, er
     resumed = resume(tmp_path, make_env(), [TrainingCheckpoint(10**6, tmp_path), Send()], device="cpu")
     assert resumed.num_timesteps == STEPS and are_restored()
     assert_same(resumed, create().learn(STEPS))
+
+
+def test_a_signal_that_is_ignored_stays_ignored(tmp_path, handlers):
+    """As Ctrl-C in a job that a shell script has put in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    make().learn(STEPS, [TrainingCheckpoint(10**6, tmp_path), Send((70, signal.SIGINT))])
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and names(tmp_path) == []
 
 
 def test_a_second_signal_stops_at_once(tmp_path, handlers):

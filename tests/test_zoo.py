@@ -27,6 +27,7 @@ from sb3_cchain.callbacks import read_returns
 from sb3_cchain.envs import RewardScale, TaskCaption, TaskVecNormalize
 from sb3_cchain.envs.task_caption import with_caption
 from sb3_cchain.methods.registry import REGISTRY
+from sb3_cchain.zoo.playing import Playing
 from tests.extras import needs_dm_control
 from tests.zoo_command import FAST, NO_EVALUATION, ROOT, SHORT_PPO, command, run, stock_train
 
@@ -311,11 +312,13 @@ def test_record_video_has_the_task_on_each_frame(tmp_path, monkeypatch):
     ],
 )
 def test_what_is_filmed_keeps_the_wrappers_of_the_settings(settings, wrapper):
-    env = zoo.create_captioned_env("Continual/CartPole-v1", hyperparams=settings, env_kwargs=dict(render_mode="rgb_array"))
+    env = Playing().create_captioned_env(
+        "Continual/CartPole-v1", hyperparams=settings, env_kwargs=dict(render_mode="rgb_array")
+    )
     assert env.env_is_wrapped(wrapper) == env.env_is_wrapped(TaskCaption) == [True]
 
 
-@pytest.mark.parametrize("create", [zoo.create_env, zoo.create_captioned_env])
+@pytest.mark.parametrize("create", [Playing().create_env, Playing().create_captioned_env])
 def test_what_is_filmed_or_pushed_has_the_arguments_of_the_settings(create):
     settings = dict(env_kwargs=dict(n_tasks=2, steps_per_task=7))
     env = create("Continual/CartPole-v1", hyperparams=settings, env_kwargs=dict(steps_per_task=5, render_mode="rgb_array"))

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_cchain import CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.checkpoint import resumable_env, saved_timesteps
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
+from sb3_cchain.zoo.checkpoint_options import plain
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
 ENV = "Continual/CartPole-v1"
@@ -224,6 +227,30 @@ def test_a_torn_checkpoint_is_passed_over(checkpoints, tmp_path):
         train(tmp_path, "--resume", tmp_path / "run", n=96, evaluation=NO_EVALUATION)
     assert (run_folder(tmp_path, 1) / "resumed_from").read_text().endswith("step_000000000032\n")
     assert saved_timesteps(run_folder(tmp_path, 1) / f"{NAME}.zip") == 96
+
+
+def test_a_resumed_run_without_a_checkpoint_of_its_own(checkpoints, tmp_path):
+    """It was killed before it saved one, so training goes on from where it went on from."""
+    train(tmp_path, "--resume", checkpoints, "--checkpoint-freq", 10**6, n=128, evaluation=NO_EVALUATION)
+    os.remove(run_folder(tmp_path, 1) / f"{NAME}.zip")
+    train(tmp_path, "--resume", run_folder(tmp_path, 1), n=128, evaluation=NO_EVALUATION)
+    assert (run_folder(tmp_path, 2) / "resumed_from").read_text().startswith(str(checkpoints))
+    assert saved_timesteps(run_folder(tmp_path, 2) / f"{NAME}.zip") == 128
+
+
+class Own(BaseCallback):
+    """Of the user's code."""
+
+    def _on_step(self):
+        return True
+
+
+def test_objects_in_a_python_file_are_the_same_in_another_process(tmp_path):
+    assert plain({"callback": [Own()], "kind": Own, "noise": NormalActionNoise(np.zeros(1), np.ones(1))}) == {
+        "callback": ["Own"],
+        "kind": "Own",
+        "noise": "NormalActionNoise(mu=[0.], sigma=[1.])",
+    }
 
 
 @pytest.mark.parametrize("options, kept", [((), 3), (("--checkpoint-keep", "1"), 1), (None, 2)])

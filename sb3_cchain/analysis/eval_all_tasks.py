@@ -17,7 +17,7 @@ class EvalAllTasks(TaskEvaluation):
     at the end of training and, if wanted, at intervals. It acts between rollouts: after the last update on a task, and before
     callbacks that come after it in the list, such as :class:`~sb3_cchain.methods.Oracle`, change the networks for the next.
     Where a task ends within a rollout, it is up to a rollout late. The tasks are the environment's own, whatever a
-    :class:`~sb3_cchain.TaskSignal` says. ``MaskablePPO`` is evaluated without masks.
+    :class:`~sb3_cchain.TaskSignal` says. ``MaskablePPO`` is evaluated with the environment's masks.
 
     Logged are
 

@@ -15,12 +15,12 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import ReturnsFile
+from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.evaluation import check_same_tasks
 from sb3_cchain.tasks.signal import (

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
@@ -150,6 +151,8 @@ class ContinualMetrics(BaseCallback):
         else:
             normalize = self._vec_normalize
             rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
+            if isinstance(self.model, OnPolicyAlgorithm):  # an EpisodicRollouts drops episodes
+                self._state["returns"][self.model._last_episode_starts] = 0.0
             self._state["returns"] += rewards
             reward = float(rewards.sum())
         self._state["reward"] += reward

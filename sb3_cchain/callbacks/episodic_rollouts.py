@@ -3,7 +3,9 @@
 from typing import Any
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
+from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
 
@@ -23,6 +25,11 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
     the rollout cuts at its return so far. The released code scores Gym Control in this way. Returns are the environment's own,
     before any scaling, where it tells them (a :class:`~sb3_cchain.ContinualEnv` does), else sums of the rewards learned from.
     """
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        if hasattr(self.model, "_last_lstm_states"):
+            raise TypeError(f"EpisodicRollouts does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_rollout_start(self) -> None:
         self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
@@ -44,10 +51,13 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
         cut = [so_far for so_far, done in zip(self._returns_so_far, self.locals["dones"], strict=True) if not done]
         self.logger.record("continual/mean_return_with_cut", float(np.mean([*self._returns, *cut])))
         buffer = self.model.rollout_buffer
+        assert self.model._last_obs is not None
+        with th.no_grad():  # sb3-contrib does not tell callbacks the last value
+            last_values = self.model.policy.predict_values(obs_as_tensor(self.model._last_obs, self.model.device))
         buffer.returns = discounted_returns(
             buffer.rewards,
             buffer.episode_starts,
-            last_values=self.locals["values"].cpu().numpy().flatten(),
+            last_values=last_values.cpu().numpy().flatten(),
             last_dones=self.locals["dones"],
             gamma=self.model.gamma,
         )

@@ -1,11 +1,11 @@
 """The state of vectorised environments, with all that is in them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor, VecVideoRecorder
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from sb3_cchain.checkpoint.object_state import ObjectStates
 from sb3_cchain.checkpoint.resumable_env import (
     RESUMED,
     Parts,
@@ -92,10 +92,10 @@ def check_same_environment(env: VecEnv, layers: Iterable[str], n_envs: int, save
     check_same_layers(layers, saved_layers)
 
 
-def remote_states(env: VecEnv) -> list[ObjectStates]:
+def remote_states(env: VecEnv) -> list[Any]:
     """
     :param env: A prepared environment, between two steps
-    :return: State of the environments that are in other processes
+    :return: State of the environments that are in other processes, and of the global random numbers there
     :raises ValueError: When the state cannot be saved
     """
     if not isinstance(env.unwrapped, SubprocVecEnv):
@@ -106,7 +106,7 @@ def remote_states(env: VecEnv) -> list[ObjectStates]:
     return [state for _, state in results]
 
 
-def restore_remotes(env: VecEnv, states: Sequence[ObjectStates]) -> None:
+def restore_remotes(env: VecEnv, states: Sequence[Any]) -> None:
     """
     Put the states of environments in other processes back.
 

@@ -35,6 +35,8 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._before: ObjectStates | None = None
         self._reset_arguments: dict[str, Any] = {}
         self._actions: list[Any] = []
+        # Reward, terminated and truncated of each step
+        self._outcomes: list[tuple[float, bool, bool]] = []
         self._observation: Any = None
 
     @property
@@ -54,7 +56,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             _ = self.np_random
         self._before = self._attributes()
         self._reset_arguments = {"seed": seed, "options": deepcopy(options)}
-        self._actions = []
+        self._actions, self._outcomes = [], []
         self.is_recorded = True
         observation, info = reset_env(self.env, seed, options)
         self._observation = observation
@@ -67,6 +69,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         self._actions.append(action.copy() if isinstance(action, np.ndarray) else action)
         observation, reward, terminated, truncated, info = self.env.step(action)
+        self._outcomes.append((float(reward), bool(terminated), bool(truncated)))
         self._observation = observation
         return observation, reward, terminated, truncated, info
 
@@ -81,6 +84,7 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             "before": self._attributes() if self._before is None else self._before,
             "reset": None if self._before is None else self._reset_arguments,
             "actions": list(self._actions),
+            "outcomes": list(self._outcomes),
             "observation": deepcopy(self._observation),
             "generator": _generator_state(self.unwrapped),
         }
@@ -94,14 +98,18 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         _renew_world(self.unwrapped)
         restore_objects(self._layers(), state["before"], self._known())
-        self._before, self._actions, self._observation, self.is_recorded = None, [], None, True
+        self._before, self._actions, self._outcomes, self._observation, self.is_recorded = None, [], [], None, True
         if state["reset"] is None:
             return
         self.reset(**state["reset"])
         for action in state["actions"]:
             self.step(action)
-        same = _same(self._observation, state["observation"]) and _generator_state(self.unwrapped) == state["generator"]
-        if not same:
+        is_same = (
+            _same(self._outcomes, state["outcomes"])
+            and _same(self._observation, state["observation"])
+            and _generator_state(self.unwrapped) == state["generator"]
+        )
+        if not is_same:
             raise ValueError(
                 f"{self.env} cannot be resumed exactly: an episode of {len(self._actions)} steps went otherwise when it was "
                 "played again. The environment is not deterministic, or it was made with other arguments. Give its class "

@@ -12,7 +12,9 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
 from sb3_cchain.checkpoint.object_state import NotSaved, ObjectStates, object_states, restore_objects, stock_class
+from sb3_cchain.checkpoint.random_state import random_state, restore_random_state
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
+from sb3_cchain.checkpoint.words import in_words
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.reset import reset_env
 
@@ -92,18 +94,22 @@ class ResumableEnv(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         ``state_dict()`` for other processes, where an error would end the process of the environment.
 
-        :return: The error, if there was one, and the state
+        :return: The error, if there was one; the state, and that of the global random numbers of the process
         """
-        return attempt(self.state_dict)
+        fault, state = attempt(self.state_dict)
+        return fault, (state, random_state())
 
-    def attempt_load(self, state: ObjectStates) -> tuple[str | None, Any]:
+    def attempt_load(self, state: tuple[ObjectStates, dict[str, Any]]) -> tuple[str | None, Any]:
         """
         ``load_state_dict()`` for other processes.
 
-        :param state: What ``state_dict()`` returned
+        :param state: What ``attempt_state()`` returned
         :return: The error, if there was one
         """
-        return attempt(self.load_state_dict, state)
+        of_environment, of_random_numbers = state
+        fault = attempt(self.load_state_dict, of_environment)
+        restore_random_state(of_random_numbers)  # last, as an episode that is played again draws some
+        return fault
 
 
 def attempt(function: Any, *args: Any, **kwargs: Any) -> tuple[str | None, Any]:
@@ -166,15 +172,19 @@ def _may_have_begun(chain: Sequence[gym.Env]) -> bool:
 def describe_single_environment(env: gym.Env) -> str:
     """
     :param env: An environment
-    :return: Its id and the classes of its wrappers, from outside to inside. Not ``str(env)``, which may tell of its
-        state
+    :return: Its id and arguments, and the classes of its wrappers, from outside to inside. Not ``str(env)``, which may tell
+        of its state
     """
     spec, names = env.spec, []
     while isinstance(env, gym.Wrapper):
         if not isinstance(env, EpisodeReplay):  # which is put in when training starts
             names.append(stock_class(type(env)).__name__)
         env = env.env
-    return f"{spec.id if spec is not None else 'without id'} ({' '.join([*names, type(env).__name__])})"
+    name = "without id" if spec is None else spec.id
+    # `render_mode` is for the eye; what words cannot tell is left out
+    arguments = {} if spec is None else {key: in_words(value) for key, value in spec.kwargs.items() if key != "render_mode"}
+    told = ", ".join(f"{key}={word}" for key, word in sorted(arguments.items()) if word is not None)
+    return f"{name}{f' with {told}' if told else ''} ({' '.join([*names, type(env).__name__])})"
 
 
 def can_save_single_environment(env: gym.Env) -> bool:

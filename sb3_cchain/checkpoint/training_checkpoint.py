@@ -90,6 +90,7 @@ class TrainingCheckpoint(BaseCallback):
         self._folder: CheckpointFolder | None = None
         self._last_saved = 0
         self._seconds_before = 0.0
+        self._started = time.monotonic()
         self._n_rollouts = 0
         self._stop_signal: int | None = None
         self._replaced_handlers: dict[int, Any] = {}
@@ -217,7 +218,13 @@ class TrainingCheckpoint(BaseCallback):
         elif self._stop_signal is not None:
             self._stop()
         elif self._is_due():
-            self._save()
+            try:
+                self._save()
+            except OSError as error:
+                warnings.warn(
+                    f"No checkpoint was saved at step {self.num_timesteps}: {error}. Training goes on, and the next rollout "
+                    "tries again."
+                )
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         exact = checkpoint.info["training_checkpoint"]["exact"]
@@ -257,7 +264,6 @@ class TrainingCheckpoint(BaseCallback):
 
     def _save(self) -> Path:
         assert self._folder is not None
-        self._last_saved = self.num_timesteps
         state, left_out = training_state(self._parts, self._folder.store, with_envs=self.exact)
         if not self.exact:
             state["lasting"] = {name: lasting_state(env, left_out) for name, env in self._parts.envs.items()}
@@ -280,6 +286,7 @@ class TrainingCheckpoint(BaseCallback):
         if self.logger.dir is not None:
             sync_files(Path(self.logger.dir))  # what comes before the checkpoint is not written again
         path = self._folder.write(info, self.model.save, state)
+        self._last_saved = self.num_timesteps
         self._note_progress()
         return path
 
@@ -305,7 +312,9 @@ class TrainingCheckpoint(BaseCallback):
 
     def _listen_to_signals(self) -> None:
         if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
-            self._replaced_handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
+            # What is ignored stays ignored, such as Ctrl-C of a job in the background of a shell script
+            heeded = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+            self._replaced_handlers = {number: signal.signal(number, self._on_signal) for number in heeded}
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self._stop_signal is None and _is_learning(self.model, frame):

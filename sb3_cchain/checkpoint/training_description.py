@@ -2,15 +2,14 @@
 
 import inspect
 from collections.abc import Mapping
-from typing import Any
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_cchain.checkpoint.environment_state import env_layers
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv, describe_single_environment
+from sb3_cchain.checkpoint.words import in_words
 
 # Arguments that do not change what is learned, are described by themselves, or are changed by callbacks
 _OTHER_ARGUMENTS = frozenset(
@@ -38,7 +37,7 @@ def describe_model(model: BaseAlgorithm) -> dict[str, str]:
     names = constructor_arguments(type(model))
     words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
     for name in sorted(names - _OTHER_ARGUMENTS):
-        value = _word(vars(model).get(name, inspect.Parameter.empty))
+        value = in_words(vars(model).get(name, inspect.Parameter.empty), with_schedules=True)
         if value is not None:
             words[name] = value
     return words
@@ -87,26 +86,3 @@ def check_same(saved: Mapping[str, str], present: Mapping[str, str], advice: str
     ]
     if differences:
         raise ValueError(f"The training that was saved differs from this one: {'; '.join(differences)}. {advice}")
-
-
-def _word(value: Any) -> str | None:
-    """A value in words; a schedule by three of its values; None for what cannot be told."""
-    if isinstance(value, type):
-        return value.__name__ if value is not inspect.Parameter.empty else None
-    if isinstance(value, Mapping):
-        words = {str(key): _word(entry) for key, entry in value.items()}
-        return None if None in words.values() else str(words)
-    if isinstance(value, (list, tuple)):
-        items = [_word(entry) for entry in value]
-        return None if None in items else f"[{', '.join(map(str, items))}]"
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return repr(value)
-    if callable(value):
-        try:
-            values = [float(value(progress)) for progress in (1.0, 0.5, 0.0)]  # pyright: ignore[reportArgumentType]
-            return f"schedule {values}"
-        except Exception:  # no schedule
-            return None
-    return None

@@ -1,13 +1,11 @@
 """All that the rest of a training depends on, besides what Stable-Baselines3 saves with a model."""
 
 import pickle
-import random
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -24,6 +22,7 @@ from sb3_cchain.checkpoint.environment_state import (
     vec_env_parts,
 )
 from sb3_cchain.checkpoint.object_state import DATA, restore_objects
+from sb3_cchain.checkpoint.random_state import random_state, restore_random_state
 from sb3_cchain.checkpoint.replay_buffer_state import restore_replay_buffer, save_replay_buffer
 from sb3_cchain.checkpoint.resumable_env import Parts
 from sb3_cchain.checkpoint.training_description import constructor_arguments
@@ -59,7 +58,7 @@ class TrainingParts(NamedTuple):
     model: BaseAlgorithm
     callbacks: dict[str, BaseCallback]
     envs: dict[str, VecEnv]
-    arguments: dict[str, dict[str, bytes]]
+    arguments: dict[str, dict[str, bytes | None]]
 
     @property
     def known(self) -> dict[str, object]:
@@ -102,11 +101,12 @@ def training_parts(model: BaseAlgorithm, callback: BaseCallback) -> TrainingPart
     return TrainingParts(model, callbacks, envs, {name: _arguments(found) for name, found in callbacks.items()})
 
 
-def _arguments(callback: BaseCallback) -> dict[str, bytes]:
-    found = {}
+def _arguments(callback: BaseCallback) -> dict[str, bytes | None]:
+    found: dict[str, bytes | None] = {}
     for name in vars(callback).keys() & constructor_arguments(type(callback)):
         value = vars(callback)[name]
-        if isinstance(value, DATA):  # not a model or an environment
+        if value is None or isinstance(value, DATA):
+            found[name] = None  # for what cannot be pickled
             with suppress(Exception):  # whatever the code of an object raises
                 found[name] = pickle.dumps(value, protocol=5)
     return found
@@ -128,11 +128,10 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
     left_out: list[str] = []
     saved = Parts({"model": model, **callbacks}, parts.known, {"model": _SKIPPED_OF_MODEL | _views(model)})
     for name, callback in callbacks.items():
-        # Callbacks keep the arguments with which the present process made them, such as the files that they write, but for
-        # those that they change themselves
+        # Callbacks keep the data with which the present process made them, but for what they change themselves
         before, now = parts.arguments[name], _arguments(callback)
-        changed = {argument for argument in before.keys() & now.keys() if before[argument] != now[argument]}
-        saved.skip[name] = _SKIPPED_OF_CALLBACK | (constructor_arguments(type(callback)) - changed)
+        unchanged = {argument for argument in before.keys() & now.keys() if before[argument] == now[argument]}
+        saved.skip[name] = _SKIPPED_OF_CALLBACK | unchanged
     envs = parts.env_parts() if with_envs else {}
     for env in envs.values():
         saved.add(env)
@@ -146,7 +145,7 @@ def training_state(parts: TrainingParts, store: ChunkStore, with_envs: bool) -> 
         ],
         "replay_buffer": None if buffer is None else save_replay_buffer(buffer, store, saved.known),
         "logged": {name: dict(vars(model.logger)[name]) for name in _PENDING if hasattr(model.logger, name)},
-        "random": _random_state(model.device),
+        "random": random_state(model.device),
     }
     return state, left_out
 
@@ -196,7 +195,7 @@ def restore_training(parts: TrainingParts, state: Mapping[str, Any], model_path:
     for name, values in state["logged"].items():
         vars(model.logger)[name].clear()
         vars(model.logger)[name].update(values)
-    _restore_random_state(state["random"], model.device)
+    restore_random_state(state["random"], model.device)
 
 
 def _restore_parameters(model: BaseAlgorithm, path: Path) -> None:
@@ -211,18 +210,3 @@ def _restore_parameters(model: BaseAlgorithm, path: Path) -> None:
 def _gsde(model: BaseAlgorithm) -> list[StateDependentNoiseDistribution]:
     distributions = [getattr(module, "action_dist", None) for module in model.policy.modules()]
     return [found for found in distributions if isinstance(found, StateDependentNoiseDistribution)]
-
-
-def _random_state(device: th.device) -> dict[str, Any]:
-    state = {"python": random.getstate(), "numpy": np.random.get_state(), "torch": th.get_rng_state()}
-    if device.type == "cuda":
-        state["cuda"] = th.cuda.get_rng_state(device)
-    return state
-
-
-def _restore_random_state(state: Mapping[str, Any], device: th.device) -> None:
-    random.setstate(state["python"])
-    np.random.set_state(state["numpy"])
-    th.set_rng_state(state["torch"])
-    if device.type == "cuda":
-        th.cuda.set_rng_state(state["cuda"], device)

@@ -139,9 +139,8 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     """
     if options.resume is None:
         return options, arguments
-    inside = options.resume / CHECKPOINTS
     try:
-        checkpoint = find_checkpoint(inside if inside.is_dir() else options.resume)
+        checkpoint = find_checkpoint(_where_to_look(options.resume))
         record = read_record(checkpoint.folder)
     except (ValueError, OSError) as error:
         sys.exit(f"--resume: {error}")
@@ -153,6 +152,14 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     keep = options.keep or record.get("checkpoint_keep", KEEP)  # earlier versions did not write it
     exact = options.exact and checkpoint.info["training_checkpoint"]["exact"]
     return options._replace(freq=freq, keep=keep, exact=exact, checkpoint=checkpoint, record=record), arguments
+
+
+def _where_to_look(resume: Path) -> Path:
+    """For a run folder its checkpoints, or those that the run itself went on from, if it was killed before it saved one."""
+    inside, resumed_from = resume / CHECKPOINTS, resume / RESUMED_FROM
+    if not any(inside.glob("step_*")) and resumed_from.is_file():
+        return Path(resumed_from.read_text().strip())
+    return inside if inside.is_dir() else resume
 
 
 def write_record(
@@ -213,6 +220,14 @@ def differences(record: Mapping[str, Any], args: argparse.Namespace, hyperparame
 def plain(value: Any) -> Any:
     """
     :param value: An option or hyperparameters
-    :return: The same as JSON holds it; classes and functions by their names
+    :return: The same as JSON holds it; classes, functions and objects that do not describe themselves by their names
     """
-    return json.loads(json.dumps(value, default=lambda entry: getattr(entry, "__qualname__", str(entry))))
+    return json.loads(json.dumps(value, default=_name))
+
+
+def _name(value: Any) -> str:
+    if hasattr(value, "__qualname__"):
+        return value.__qualname__
+    kind = type(value)
+    describes_itself = kind.__str__ is not object.__str__ or kind.__repr__ is not object.__repr__
+    return str(value) if describes_itself else kind.__qualname__

@@ -11,11 +11,10 @@ from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common import callbacks, evaluation
 
 try:
+    import rl_zoo3.enjoy
     import rl_zoo3.train
     import rl_zoo3.utils
     import yaml
@@ -24,14 +23,14 @@ try:
 except ImportError as error:
     raise ImportError(f'The sb3-cchain command needs RL Zoo ({error}): pip install "sb3-cchain[zoo]"') from error
 
-from sb3_cchain.checkpoint import check_model_file
-from sb3_cchain.envs import TaskCaption
+from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo import inspect as zoo_inspect
 from sb3_cchain.zoo.checkpoint_options import find_resumed, make_parser, take_options
 from sb3_cchain.zoo.experiment import ExperimentManager
 from sb3_cchain.zoo.hub import working_clients
+from sb3_cchain.zoo.playing import Playing
 from sb3_cchain.zoo.search import register_search_spaces
 from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
 
@@ -43,63 +42,18 @@ MODULES = ("record_video", "record_training", "benchmark", "load_from_hub", "pus
 PLAYING = ("enjoy", "record_video", "push_to_hub")
 
 _RL_ZOO_ALGOS = dict(ALGOS)
-_create_test_env = rl_zoo3.utils.create_test_env
 
 
-def register_algorithms(playing: bool = False) -> None:
+def register_algorithms(playing: Playing | None = None) -> None:
     """
     Make all rows of the registry known to RL Zoo, in place.
 
-    :param playing: Whether models are loaded to play, not to train; see :func:`for_playing`
+    :param playing: For commands that load models to play, not to train
     """
     algorithms = {**_RL_ZOO_ALGOS, **{method.algo: method.algorithm for method in REGISTRY}}
-    ALGOS.update({name: for_playing(algorithm) if playing else algorithm for name, algorithm in algorithms.items()})
+    ALGOS.update({name: playing.algorithm(algorithm) if playing else algorithm for name, algorithm in algorithms.items()})
     register_search_spaces()
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
-
-
-def for_playing(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """
-    :param algorithm: An algorithm
-    :return: The same, whose ``load()`` makes no replay buffer (RL Zoo does so for a list of names only) and checks that the
-        file is whole
-    """
-
-    def load(path: str, *args: Any, **kwargs: Any) -> BaseAlgorithm:
-        check_model_file(path)
-        if issubclass(algorithm, OffPolicyAlgorithm):
-            kwargs.update(buffer_size=1, optimize_memory_usage=False)
-        return algorithm.load(path, *args, **kwargs)
-
-    return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
-
-
-def create_env(env_id: str, hyperparams: dict[str, Any], env_kwargs: dict[str, Any], **kwargs: Any) -> VecEnv:
-    """
-    RL Zoo's ``create_test_env``, with the ``env_kwargs`` of the settings, too. RL Zoo adds them in ``enjoy`` alone.
-
-    :param env_id: Environment id
-    :param hyperparams: Settings of the training
-    :param env_kwargs: Arguments of the environment, besides those of the settings
-    :param kwargs: Other arguments of RL Zoo's
-    :return: The vectorised environment
-    """
-    env_kwargs = {**(hyperparams.get("env_kwargs") or {}), **env_kwargs}
-    return _create_test_env(env_id, hyperparams=hyperparams, env_kwargs=env_kwargs, **kwargs)
-
-
-def create_captioned_env(env_id: str, hyperparams: dict[str, Any], **kwargs: Any) -> VecEnv:
-    """
-    :func:`create_env`, with the task on each frame.
-
-    :param env_id: Environment id
-    :param hyperparams: Settings of the training
-    :param kwargs: Other arguments of :func:`create_env`
-    :return: The vectorised environment
-    """
-    wrappers = hyperparams.get("env_wrapper") or []
-    wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
-    return create_env(env_id, hyperparams={**hyperparams, "env_wrapper": [*wrappers, TaskCaption]}, **kwargs)
 
 
 def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
@@ -125,16 +79,25 @@ def run(command: str) -> None:
 
     :param command: Name of the command, which is also ``sys.argv[1]``
     """
-    register_algorithms(playing=command in PLAYING)
-    # RL Zoo reads the files beside a model by a loader that runs what is in them
-    with replaced(yaml, "UnsafeLoader", SettingsLoader):
+    playing = Playing()
+    register_algorithms(playing if command in PLAYING else None)
+    with (
+        # RL Zoo reads the files beside a model by a loader that runs what is in them
+        replaced(yaml, "UnsafeLoader", SettingsLoader),
+        # Callbacks, and push_to_hub, evaluate without masks
+        replaced(callbacks, "evaluate_policy", evaluate_policy),
+        replaced(evaluation, "evaluate_policy", evaluate_policy),
+    ):
         if command == "inspect":
             if code := zoo_inspect.main(sys.argv[2:]):
                 sys.exit(code)
         elif command in MODULES:
-            run_module(command)
+            run_module(command, playing)
         elif command == "train":
             train(sys.argv[2:])
+        elif command == "enjoy":
+            with replaced(rl_zoo3.enjoy, "create_test_env", playing.create_env):
+                run_script(command)
         else:
             run_script(command)
 
@@ -182,11 +145,12 @@ def run_script(name: str) -> None:
     run()
 
 
-def run_module(name: str) -> None:
+def run_module(name: str, playing: Playing) -> None:
     """
     Run a module of RL Zoo's as ``python -m`` does, with the algorithms registered.
 
     :param name: Its name, which ``sys.argv[1]`` is as well
+    :param playing: Makes its environment
     """
     del sys.argv[1]
     get_trained_models = rl_zoo3.utils.get_trained_models
@@ -195,10 +159,11 @@ def run_module(name: str) -> None:
         # benchmark uses the id in paths, where "Continual/..." would be two folders
         return {key: (algo, EnvironmentName(env_id)) for key, (algo, env_id) in get_trained_models(log_folder).items()}
 
+    create_env = playing.create_captioned_env if name == "record_video" else playing.create_env
     with (
         replaced(subprocess, "call", call_sb3_cchain),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
-        replaced(rl_zoo3.utils, "create_test_env", create_captioned_env if name == "record_video" else create_env),
+        replaced(rl_zoo3.utils, "create_test_env", create_env),
         working_clients() if name.endswith("_hub") else nullcontext(),
         warnings.catch_warnings(),
     ):

@@ -1,6 +1,5 @@
 """RL Zoo's training, with run folders that are never shared, saves that a kill does not tear, and training that goes on."""
 
-import re
 import shutil
 import signal
 import sys
@@ -39,6 +38,7 @@ from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, differences, plain, write_record
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
+from sb3_cchain.zoo.statistics import statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
 
 
@@ -342,17 +342,3 @@ def make_run_folder(parent: str | Path, name: str) -> Path:
             return folder
         except FileExistsError:  # made by another process since
             number += 1
-
-
-def statistics_path(model_path: str | Path, env_name: str) -> Path:
-    """
-    :param model_path: A model saved by ``sb3-cchain train``
-    :param env_name: The environment's name in RL Zoo's folders
-    :return: Where the statistics of its ``VecNormalize`` are: those of a checkpoint beside it, those of the final and of the
-        best model in the folder of the settings
-    """
-    path = Path(model_path)
-    checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", path.stem)
-    if checkpoint is None:
-        return path.parent / env_name / "vecnormalize.pkl"
-    return path.with_name(f"{checkpoint[1]}_vecnormalize_{checkpoint[2]}.pkl")

@@ -1,8 +1,10 @@
 """The command ``sb3-cchain inspect``."""
 
 import argparse
+import importlib
 import json
 import math
+import pickle
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
@@ -28,12 +30,16 @@ from sb3_cchain.analysis.inspection import Inspection, findings_text, inspect_mo
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.checkpoint import check_model_file, check_writable
+from sb3_cchain.checkpoint.checkpoint_folder import MODEL
+from sb3_cchain.checkpoint.files import load_statistics
 from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
 from sb3_cchain.zoo.settings import read_saved
+from sb3_cchain.zoo.statistics import checkpoint_statistics
 
 
 def make_as_trained(
-    model_path: Path, env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]
+    model_path: Path, env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any], statistics: Path | None
 ) -> tuple[VecEnv, list[BaseCallback]]:
     """
     Make what RL Zoo trained a model with: the environment with its arguments, wrappers and normalisation, and the callbacks of
@@ -44,10 +50,15 @@ def make_as_trained(
     :param n_envs: Number of environments
     :param seed: Seed
     :param env_kwargs: Arguments of the environment, besides those it was trained with
+    :param statistics: What ``VecNormalize.save()`` wrote, if not the file beside the model
     :return: The environment, as in training, and the callbacks
-    :raises ValueError: When the YAML files beside the model are not as RL Zoo writes them
+    :raises ValueError: When the YAML files beside the model are not as RL Zoo writes them, or the statistics are missing or of
+        another kind
     """
-    folder = model_path.parent / env_id.replace("/", "-")
+    env_name = env_id.replace("/", "-")
+    # A checkpoint of training that goes on exactly is deeper in the run folder
+    is_deep = model_path.name == MODEL and model_path.parent.parent.name == CHECKPOINTS
+    folder = (model_path.parents[2] if is_deep else model_path.parent) / env_name
     settings, options = (read_saved(folder / name).get("env_kwargs") for name in ("config.yml", "args.yml"))
     env_kwargs = {**(settings or {}), **(options or {}), **env_kwargs}
     hyperparams, stats_path = get_saved_hyperparams(str(folder), norm_reward=True)
@@ -67,6 +78,16 @@ def make_as_trained(
     normalize = unwrap_vec_normalize(env)
     if normalize is not None:
         normalize.training, normalize.norm_reward = True, norm_reward
+    if normalize is None:
+        return (env if statistics is None else VecNormalize.load(str(statistics), env)), callbacks
+    if statistics is None and is_deep:
+        raise ValueError(
+            "it was trained with normalisation, and its statistics are within the checkpoint: give a file of them as "
+            "--vec-normalize"
+        )
+    statistics = statistics or checkpoint_statistics(model_path)
+    if statistics is not None and statistics.is_file():
+        load_statistics(normalize, statistics)  # instead of those of the end of training
     return env, callbacks
 
 
@@ -90,7 +111,7 @@ def load_as_trained(
     :param seed: Seed of the environment
     :param n_steps: Size of the replay buffer, for off-policy algorithms
     :param device: PyTorch device
-    :param statistics: What ``VecNormalize.save()`` wrote, for a model that is in no folder of RL Zoo's
+    :param statistics: What ``VecNormalize.save()`` wrote, if not the file beside the model
     :return: The model, and the callbacks of its settings
     :raises ValueError: When the file is no whole model or one of another algorithm, or the statistics cannot be read
     """
@@ -103,12 +124,12 @@ def load_as_trained(
     algorithm = ALGOS[algo] if algo else algorithm_of(path)
     if algo:
         check_algorithm(path, data, algo)
-    env, callbacks = make_as_trained(path, env_id, data.get("n_envs", 1), seed, env_kwargs)
     if statistics is not None:
         try:
-            env = VecNormalize.load(str(statistics), env)
+            pickle.loads(statistics.read_bytes())
         except Exception as error:  # whatever reading a pickle raises
             raise ValueError(f"--vec-normalize {statistics} cannot be read: {error!r}") from error
+    env, callbacks = make_as_trained(path, env_id, data.get("n_envs", 1), seed, env_kwargs, statistics)
     settings: dict[str, Any] = {"buffer_size": n_steps} if issubclass(algorithm, OffPolicyAlgorithm) else {}
     try:
         model = algorithm.load(path, env, device=device, **settings)
@@ -158,6 +179,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("models", nargs="+", type=Path, metavar="MODEL.zip", help="One saved model, or two to compare")
     parser.add_argument("--env", required=True, help="Environment id")
     parser.add_argument(
+        "--gym-packages", nargs="+", default=[], metavar="PACKAGE", help="Packages to import that register environments"
+    )
+    parser.add_argument(
         "--env-kwargs",
         nargs="+",
         action=StoreDict,
@@ -172,7 +196,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--vec-normalize",
         type=Path,
         metavar="STATS.pkl",
-        help="Statistics that VecNormalize.save() wrote, for a model that is in no folder of RL Zoo's",
+        help="Statistics that VecNormalize.save() wrote, by default those beside the model in RL Zoo's folder",
     )
     parser.add_argument("--algo", choices=sorted(ALGOS), help="Algorithm, by default the one that the file tells")
     parser.add_argument(
@@ -244,6 +268,11 @@ def main(arguments: Sequence[str]) -> int:
     parser = make_parser()
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
+    for package in args.gym_packages:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            parser.error(f"--gym-packages {package}: {error}")
     names = ["A", "B"] if len(args.models) == 2 else [args.models[0].stem]
     console = Console(stderr=args.json)
     # RL Zoo prints how it makes an environment

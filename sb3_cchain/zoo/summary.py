@@ -173,6 +173,8 @@ class TrainingSummary:
         if "Model" in places and number.isdecimal():  # RL Zoo does not find a folder that ends in a uuid
             command = ["sb3-cchain", "enjoy", "--algo", args.algo, "--env", args.env, "-f", args.log_folder]
             command += ["--exp-id", number]
+            if args.gym_packages:
+                command += ["--gym-packages", *args.gym_packages]
             last = 0 if self._clock is None else max(task_steps([], self._clock, self._model.num_timesteps))
             if last > 0 and args.env.startswith("Continual/"):  # other environments may not have the argument
                 command += ["--env-kwargs", f"first_task:{last}"]

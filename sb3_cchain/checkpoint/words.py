@@ -1,0 +1,34 @@
+"""Values in words, to be compared with those of another process."""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+def in_words(value: Any, with_schedules: bool = False) -> str | None:
+    """
+    :param value: Any
+    :param with_schedules: Whether functions are called as schedules, and told by three of their values
+    :return: It in words that are the same in another process; None for what words cannot tell
+    """
+    if isinstance(value, type):
+        return value.__name__ if value is not inspect.Parameter.empty else None
+    if isinstance(value, Mapping):
+        words = {str(key): in_words(entry, with_schedules) for key, entry in value.items()}
+        return None if None in words.values() else str(words)
+    if isinstance(value, (list, tuple)):
+        items = [in_words(entry, with_schedules) for entry in value]
+        return None if None in items else f"[{', '.join(map(str, items))}]"
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return repr(value)
+    if with_schedules and callable(value):
+        try:
+            values = [float(value(progress)) for progress in (1.0, 0.5, 0.0)]  # pyright: ignore[reportArgumentType]
+            return f"schedule {values}"
+        except Exception:  # no schedule
+            return None
+    return None
