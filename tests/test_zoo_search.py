@@ -179,6 +179,8 @@ def test_arguments_of_a_callback():
     redo, name = sb3_cchain.methods.ReDo, "sb3_cchain.methods.ReDo"
     with pytest.raises(ValueError, match=r"`callback` must have ReDo, got \['sb3_cchain.TaskSync'\]"):
         search.add_to_callback(["sb3_cchain.TaskSync"], redo, {"tau": 0.1})
+    with pytest.raises(ValueError, match=r"-optimize: `callback` must hold names of classes, .* got <.*ReDo object"):
+        search.add_to_callback([redo()], redo, {"tau": 0.1})
     assert search.add_to_callback(name, redo, {"tau": 0.1}) == [{name: {"tau": 0.1}}]
     # By another path to the same class
     name = f"{redo.__module__}.ReDo"

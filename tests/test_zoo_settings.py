@@ -359,7 +359,7 @@ def test_nothing_in_a_file_is_called(text, tmp_path, monkeypatch):
     for name in ("args.yml", "config.yml"):
         path = tmp_path / "ppo_cchain" / "CartPole-v1" / name
         path.write_text(text)
-        with pytest.raises(yaml.YAMLError):
+        with pytest.raises(SystemExit, match=r"(?s)cannot be read: .*give their names in a YAML file"):
             command("enjoy", "--algo", "ppo_cchain", "--env", "CartPole-v1", "-f", ".", "--exp-id", "-1", "--no-render")
         path.unlink()
     assert not (tmp_path / "made").exists()

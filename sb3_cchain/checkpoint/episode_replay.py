@@ -113,7 +113,8 @@ class EpisodeReplay(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             raise ValueError(
                 f"{self.env} cannot be resumed exactly: an episode of {len(self._actions)} steps went otherwise when it was "
                 "played again. The environment is not deterministic, or it was made with other arguments. Give its class "
-                "`state_dict()` and `load_state_dict(state)`, or begin new episodes (TrainingCheckpoint(..., exact=False))"
+                "`state_dict()` and `load_state_dict(state)`, or save training by TrainingCheckpoint(..., exact=False), which "
+                "begins new episodes. What was trained so far is in the checkpoint's model.zip, for load()"
             )
 
     def _attributes(self) -> ObjectStates:

@@ -140,7 +140,7 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
     if is_inexact(base):
         raise ValueError(
             f"{base} cannot be resumed exactly, because its simulator saves only a part of its state. Begin new episodes when "
-            "training is resumed (TrainingCheckpoint(..., exact=False))"
+            "training is resumed: TrainingCheckpoint(..., exact=False), on the command line --checkpoint-inexact"
         )
     if isinstance(base, ContinualEnv):
         for task_id, task in enumerate(base.tasks):

@@ -7,7 +7,8 @@ import runpy
 import subprocess
 import sys
 import warnings
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -82,6 +83,7 @@ def run(command: str) -> None:
     playing = Playing()
     register_algorithms(playing if command in PLAYING else None)
     with (
+        _told_in_a_line(),
         # RL Zoo reads the files beside a model by a loader that runs what is in them
         replaced(yaml, "UnsafeLoader", SettingsLoader),
         # Callbacks, and push_to_hub, evaluate without masks
@@ -100,6 +102,19 @@ def run(command: str) -> None:
                 run_script(command)
         else:
             run_script(command)
+
+
+@contextmanager
+def _told_in_a_line() -> Iterator[None]:
+    """What settings beside a model hold that cannot be read, such as the objects of a Python file."""
+    try:
+        yield
+    except yaml.constructor.ConstructorError as error:
+        where = error.problem_mark.name if error.problem_mark is not None else "the settings"
+        sys.exit(
+            f"{where} cannot be read: {error.problem}. Import classes of your own by --gym-packages MODULE. Objects, such as "
+            "callbacks in a Python file of settings, cannot be read back: give their names in a YAML file"
+        )
 
 
 def train(arguments: list[str]) -> None:

@@ -163,11 +163,13 @@ def add_to_callback(callbacks: str | list[Any], callback_class: type, arguments:
     :param callback_class: Class of one of them
     :param arguments: Arguments of that one
     :return: The same with these arguments, and all others as they were
-    :raises ValueError: When there is no such callback
+    :raises ValueError: When there is no such callback, or one is an object
     """
     entries = [callbacks] if isinstance(callbacks, str) else callbacks
     with_arguments, found = [], False
     for entry in entries:
+        if not isinstance(entry, str | dict):
+            raise ValueError(f"-optimize: `callback` must hold names of classes, as a YAML file does, got {entry}")
         ((name, given),) = entry.items() if isinstance(entry, dict) else [(entry, {})]
         if issubclass(get_class_by_name(name), callback_class):
             found, given = True, {**(given or {}), **arguments}
