@@ -8,7 +8,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
-from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.replaced import replaced
@@ -101,8 +101,7 @@ class LogStdRestart(TaskBoundary):
             policy.log_std.fill_(policy.log_std_init if self.log_std is None else self.log_std)
         if self.model.use_sde:
             policy.reset_noise(self.model.n_envs)
-        for reducer in churn_reducers(self):
-            reducer.forget_reference()
+        forget_references(self)
 
 
 class EntropyBonusRestart(TaskBoundary):

@@ -3,7 +3,7 @@
 import torch as th
 
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
-from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.tensorboard.layout import add_charts
@@ -82,8 +82,7 @@ class ShrinkAndPerturb(TaskBoundary):
 
     def _on_task_switch(self) -> None:
         self._shrink_and_perturb()
-        for reducer in churn_reducers(self):
-            reducer.forget_reference()
+        forget_references(self)
 
     def _shrink_and_perturb(self) -> None:
         fresh = fresh_policy(self.model)

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from typing import ClassVar
 
-from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.validation import check_number
 
@@ -48,8 +48,7 @@ class SwitchOrInterval(TaskBoundary):
 
     def _on_task_switch(self) -> None:
         self._act()
-        for reducer in churn_reducers(self):
-            reducer.forget_reference()
+        forget_references(self)
         self.n_resets += 1
 
     def _on_rollout_end(self) -> None:

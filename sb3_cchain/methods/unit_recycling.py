@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.methods.adam_rel import reset_step_count
-from sb3_cchain.methods.churn_reducers import churn_reducers
+from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units
 from sb3_cchain.methods.plain_networks import check_plain_networks
@@ -130,8 +130,7 @@ class IntervalRecycling(UnitRecycling, TrainingInterval):
         chosen = self._choose(observations)
         self._recycle_units(chosen)
         if self.n_recycled > n_before:
-            for reducer in churn_reducers(self):
-                reducer.forget_reference()
+            forget_references(self)
         self.logger.record(f"{self.name}/n_recycled", self.n_recycled)
         self.logger.record(f"{self.name}/dormant_share", (self.n_recycled - n_before) / sum(map(len, chosen)))
         for layer, units in zip(self._layers, chosen, strict=True):
