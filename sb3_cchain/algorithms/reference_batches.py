@@ -74,23 +74,24 @@ class ReferenceBatches:
         if batch_size is None:  # TRPO's policy, which no optimiser changes
             yield from self._get(None)
             return
-        epoch = self._draw_epoch(batch_size)
-        n_samples, n_minibatches, full_size = sum(epoch.sizes), len(epoch.sizes), epoch.sizes[0]
-        half_an_epoch = (n_minibatches + 1) // 2 * full_size
-        end = n_in_next = 0
-        for position, minibatch_size in enumerate(epoch.sizes):
-            end += minibatch_size
-            n_outside = n_samples - minibatch_size
-            size = min(max(round(self._size * full_size), 1), n_outside or n_samples)
-            self.n_shared, n_in_next = n_in_next, 0
-            start = end
-            if self._kind == "independent":
-                start += max(min(half_an_epoch - minibatch_size, n_outside - size), 0)
-            elif position + 1 < n_minibatches:
-                n_in_next = min(size, epoch.sizes[position + 1])
-            self.current = epoch.observations(start % n_samples, size)
+        epoch, size_before = self._draw_epoch(batch_size), 0
+        for position, (start, size) in enumerate(self._places(epoch.sizes)):
+            # With "next", the reference batch of the minibatch before begins with this minibatch
+            self.n_shared = min(size_before, epoch.sizes[position]) if self._kind == "next" else 0
+            self.current = epoch.observations(start, size)
             self.starts_epoch = position == 0
             yield epoch.minibatch(position)
+            size_before = size
+
+    def _places(self, sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
+        """For each minibatch where in the epoch its reference batch begins, and its size."""
+        n_samples, half_an_epoch, end = sum(sizes), (len(sizes) + 1) // 2 * sizes[0], 0
+        for minibatch_size in sizes:
+            end += minibatch_size
+            n_outside = n_samples - minibatch_size
+            size = min(max(round(self._size * sizes[0]), 1), n_outside or n_samples)
+            away = max(min(half_an_epoch - minibatch_size, n_outside - size), 0) if self._kind == "independent" else 0
+            yield (end + away) % n_samples, size
 
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> PyTorchObs | None:
         """As of :class:`RolloutReferences`."""

@@ -41,11 +41,9 @@ def joint_passes(
         assert reducer.old_outputs is not None
         further = rows(reducer.reference, slice(references.n_shared, None))
         values, log_prob, entropy, outputs = evaluate_jointly(networks, observations, actions, further)
-        n_due = len(reducer.old_outputs)
-        if n_due < len(outputs):
-            # The reference batch begins with the minibatch, or comes after it
-            start = 0 if references.n_shared else n_observations(observations)
-            outputs = outputs[start : start + n_due]
+        # The reference batch begins with the minibatch, or comes after it
+        start = 0 if references.n_shared else n_observations(observations)
+        outputs = outputs[start : start + len(reducer.old_outputs)]
         churn_loss = reducer.divergence(reducer.old_outputs, of_action_net(policy, outputs))
         return carrying(values, churn_loss, coef), log_prob, entropy
 
