@@ -68,7 +68,7 @@ class Playing:
             self._take_statistics_of(Path(path))
             return loaded.load(path, *args, **kwargs)
 
-        return type(algorithm.__name__, (algorithm,), {"load": staticmethod(load), "__module__": algorithm.__module__})
+        return _subclass(algorithm, load=staticmethod(load))
 
     def _with_masks(self, algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
         def predict(model: Any, observation: Any, *args: Any, **kwargs: Any) -> Any:
@@ -76,10 +76,15 @@ class Playing:
                 kwargs.setdefault("action_masks", get_action_masks(self._env))
             return algorithm.predict(model, observation, *args, **kwargs)
 
-        return type(algorithm.__name__, (algorithm,), {"predict": predict, "__module__": algorithm.__module__})
+        return _subclass(algorithm, predict=predict)
 
     def _take_statistics_of(self, model_path: Path) -> None:
         normalize = None if self._env is None else unwrap_vec_normalize(self._env)
         statistics = checkpoint_statistics(model_path)
         if normalize is not None and statistics is not None and statistics.is_file():
             load_statistics(normalize, statistics)
+
+
+def _subclass(algorithm: type[BaseAlgorithm], **methods: Any) -> Any:
+    """Of the same name."""
+    return type(algorithm.__name__, (algorithm,), {**methods, "__module__": algorithm.__module__})
