@@ -4,13 +4,12 @@ import sys
 from typing import Any
 
 from stable_baselines3.common import evaluation
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 _evaluate_policy = evaluation.evaluate_policy
 
 
-def evaluate_policy(model: BaseAlgorithm, env: VecEnv, *args: Any, **kwargs: Any) -> Any:
+def evaluate_policy(model: Any, env: VecEnv, *args: Any, **kwargs: Any) -> Any:
     """
     SB3's ``evaluate_policy``, and for MaskablePPO that of sb3-contrib, which asks the environment for its masks.
 
