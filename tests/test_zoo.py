@@ -123,7 +123,7 @@ def test_evaluation_in_a_zoo_run_follows_the_task(algo, tmp_path, monkeypatch):
         tasks.append((model.num_timesteps, env.get_attr("task_id")))
         return result
 
-    monkeypatch.setattr(callbacks, "evaluate_policy", spy)
+    monkeypatch.setattr(zoo, "evaluate_policy", spy)
     command(
         *("train", "--algo", algo, "--env", "Continual/CartPole-v1", "-n", "96", "-f", tmp_path, *FAST, *SHORT_PPO),
         *("--env-kwargs", "steps_per_task:32", "--eval-freq", "16", "--eval-episodes", "1"),
@@ -232,7 +232,7 @@ def test_unknown_environment_names_the_nearest():
         command("train", "--algo", "ppo_cchain", "--env", "Continual/Acrobat-v1")
 
 
-@pytest.mark.parametrize("playing", [False, True])
+@pytest.mark.parametrize("playing", [None, Playing()])
 def test_all_methods_are_known(playing):
     zoo.register_algorithms(playing)
     for method in REGISTRY:
