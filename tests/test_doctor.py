@@ -13,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
@@ -22,13 +22,21 @@ from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, DoubleDQ
 from sb3_cchain.algorithms.contrib import CChainTQC
 from sb3_cchain.analysis import Doctor, remedies
 from sb3_cchain.analysis import doctor as doctor_module
+from sb3_cchain.analysis import symptoms as symptoms_module
 from sb3_cchain.analysis.findings import BY_NAME, CHECKS, diagnose, findings_markdown
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.analysis.model_outputs import ModelOutputs
 from sb3_cchain.analysis.remedies import Remedy
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
-from sb3_cchain.analysis.symptoms import network_symptoms, note_gradients, policy_change, value_symptoms
+from sb3_cchain.analysis.symptoms import (
+    acting_symptoms,
+    network_symptoms,
+    note_gradients,
+    policy_change,
+    value_symptoms,
+    weight_symptoms,
+)
 from sb3_cchain.methods import TRAC, UPGD, L2Init, WeightClipping
 from sb3_cchain.methods.registry import METHOD_NAMES
 from sb3_cchain.networks import CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
@@ -195,6 +203,14 @@ def test_a_model_that_an_update_breaks():
     assert "weight gain inf" in message
 
 
+@pytest.mark.parametrize("value, found", [(math.nan, "exploding_weights"), (-200.0, "too_large_updates")])
+def test_a_standard_deviation_that_an_update_breaks(value, found, monkeypatch):
+    model, doctor = make(PPO, actions=BOX_ACTIONS), Doctor(interval=1)
+    monkeypatch.setattr(model, "train", lambda: fill(model.policy.log_std, value))
+    (message,) = warned(lambda: model.learn(64, callback=doctor))
+    assert [finding.check.name for finding in doctor.findings] == [found] and "inf" in message
+
+
 def test_likely_findings_come_first():
     symptoms = {"discount": 0.0, "weight_gain/a": 1.0, "weight_gain/b": 100.0}
     first, second = diagnose(symptoms, make(PPO))
@@ -212,6 +228,9 @@ def test_policy_change():
     old, new = (ModelOutputs(action_means=th.tensor([[mean, 0.0]])) for mean in (0.0, 3.0))
     assert policy_change(old, new, th.tensor([[2.0, 1.0]]), th.tensor([[2.0, 1.0]])) == pytest.approx(9 / 8)
     assert policy_change(ModelOutputs(), ModelOutputs(), None, None) is None
+    # An action that has become impossible
+    old, new = (ModelOutputs(probabilities=th.tensor([[p, 1 - p]])) for p in (0.5, 0.0))
+    assert 10 < policy_change(old, new, None, None) < math.inf
 
 
 def test_gradients_are_the_greatest_of_all_updates_in_units_of_epsilon():
@@ -237,6 +256,48 @@ def test_networks():
     assert symptoms[f"feature_rank/{part}"] == 1
     # Root mean square 1/4, of 4 inputs
     assert symptoms[f"weight_gain/{part}.0.weight"] == 0.5
+    assert f"saturated_units/{part.replace('policy', 'value')}.1" not in symptoms
+
+
+def test_the_rank_of_features_that_differ_by_rounding_or_of_a_single_one():
+    model, observations = make(PPO, policy_kwargs=dict(net_arch=dict(pi=[4], vf=[1]))), th.linspace(-1, 1, 20)
+    layer = model.policy.mlp_extractor.policy_net[0]
+    fill(layer.weight, 1e-7)
+    fill(layer.bias, 1.0)
+    symptoms = network_symptoms(model, {"observations": observations.reshape(-1, 1).expand(-1, 4)})
+    assert symptoms["feature_rank/mlp_extractor.policy_net"] == 0
+    assert "feature_rank/mlp_extractor.value_net" not in symptoms
+
+
+@pytest.mark.parametrize(
+    "algorithm, bound, settings, mean, diversity, saturated",
+    [
+        (PPO, 4, {}, 2.0, 0.5, 0.0),
+        (PPO, 4, {}, 5.0, 1.0, 1.0),
+        (SAC, 4, {}, 1.0, 1.0, 1.0),  # its networks act between -1 and 1
+        (PPO, 1, dict(use_sde=True, policy_kwargs=dict(squash_output=True)), 0.5, math.tanh(0.5), 0.0),
+    ],
+)
+def test_continuous_actions(algorithm, bound, settings, mean, diversity, saturated, monkeypatch):
+    monkeypatch.setattr(symptoms_module, "_exploration", lambda *_: None)
+    model = make(algorithm, actions=spaces.Box(-bound, bound, (1,), np.float32), **settings)
+    found = acting_symptoms(model, {}, ModelOutputs(action_means=th.tensor([[mean], [-mean]])))
+    assert found == {"action_diversity": pytest.approx(diversity), "saturated_actions": saturated}
+
+
+def test_diversity_of_sub_actions_of_different_sizes():
+    """Two equally likely actions of two, and of four, where half the entropy is the greatest."""
+    model = make(PPO, actions=spaces.MultiDiscrete([2, 4]))
+    probabilities = th.tensor([[[0.5, 0.5, 0.0, 0.0], [0.5, 0.5, 0.0, 0.0]]])
+    found = acting_symptoms(model, {}, ModelOutputs(probabilities=probabilities))
+    assert found == {"action_diversity": pytest.approx(0.75), "exploration": pytest.approx(0.75)}
+
+
+def test_noise_of_several_environments():
+    noise = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.full(2, 0.3)), 1)
+    model = make(TD3, action_noise=noise)
+    found = acting_symptoms(model, {"observations": th.zeros(2, 4)}, ModelOutputs(action_means=th.zeros(2, 2)))
+    assert found["exploration"] == pytest.approx(0.3)
 
 
 def test_diversity_and_exploration():
@@ -320,6 +381,26 @@ def test_values_are_compared_with_the_rewards_of_single_steps(n_steps):
     symptoms = value_symptoms(model, 32)
     assert symptoms["value_excess"] == pytest.approx(4, rel=1e-3)
     assert symptoms["value_scale"] == pytest.approx({1: 1 + 0.5 * 8, 3: 1.75 + 0.125 * 8}[n_steps], rel=0.1)
+
+
+@pytest.mark.parametrize("length, target", [(1, 1.0), (1000, 1 + 0.5 * 8)])
+def test_the_value_of_a_state_is_the_greatest_and_that_of_the_last_one_is_zero(length, target):
+    model = make(DQN, env=CountEnv(length=length), gamma=0.5, learning_starts=150).learn(150)
+    for parameter in model.q_net.parameters():
+        nn.init.zeros_(parameter)
+    with th.no_grad():
+        model.q_net.q_net[-1].bias.copy_(th.tensor([8.0, -8.0]))
+    # Of targets that are all the same there is no spread
+    assert value_symptoms(model, 32) == {"value_scale": pytest.approx(target), "value_excess": pytest.approx(4)}
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
+def test_the_threshold_is_healthy_and_what_is_no_number_says_nothing(check):
+    assert not check.is_sick(check.threshold)
+    assert check.is_sick(math.nextafter(check.threshold, math.inf if check.sick == "above" else -math.inf))
+    values = {f"{check.measure}/a": math.nan, f"{check.measure}/b": 0.5}
+    assert check.worst(values) == check.worst(dict(reversed(values.items()))) == ("b", 0.5)
+    assert check.worst({check.measure: math.nan}) is None
 
 
 # --- Remedies -----------------------------------------------------------------------------------------------------------
@@ -418,6 +499,36 @@ def test_warns_once_of_each_finding():
     assert dormant.startswith("At step 128: ") and "Try: ReDo, which" in dormant
     logged = model.logger.name_to_value
     assert logged["doctor/dormant_units"] == 1 and logged["doctor/n_findings"] == len(doctor.findings) >= 3
+
+
+def test_a_training_that_begins_anew_is_warned_of_again():
+    model, doctor = dead_units(), Doctor(interval=1)
+    first, second = (warned(lambda: model.learn(64 * 2, callback=doctor, log_interval=100)) for _ in range(2))
+    assert first and second == first
+
+
+def test_a_look_sees_what_its_own_training_did():
+    """The weights after it, and no gradients of the next."""
+    model, doctor = make(PPO), Doctor(interval=1)
+    model.learn(64, callback=doctor)
+    first = doctor.symptoms
+    assert first.items() >= weight_symptoms(model).items()
+    doctor.interval = 100
+    model.learn(64, callback=doctor, reset_num_timesteps=False)
+    assert doctor.symptoms == first
+    assert weight_symptoms(model)["weight_gain/action_net.weight"] != first["weight_gain/action_net.weight"]
+
+
+def test_a_look_that_was_interrupted_is_forgotten(monkeypatch):
+    model, doctor, looked_at = make(PPO), Doctor(interval=1), []
+    monkeypatch.setattr(doctor, "_log", lambda: looked_at.append(doctor.num_timesteps))
+    monkeypatch.setattr(model, "train", lambda: (_ for _ in ()).throw(Stopped))
+    with pytest.raises(Stopped):
+        model.learn(64, callback=doctor)
+    monkeypatch.undo()
+    monkeypatch.setattr(doctor, "_log", lambda: looked_at.append(doctor.num_timesteps))
+    model.learn(64, callback=doctor)
+    assert looked_at == [64]
 
 
 def test_a_healthy_training_is_not_warned_of():

@@ -63,10 +63,8 @@ def acting_symptoms(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -
         spread = actions.var(dim=0, unbiased=False)
         noise = th.zeros_like(low) if exploration is None else exploration * th.ones_like(low)
         symptoms["action_diversity"] = ((spread / scale**2 + noise**2).sqrt()).mean().item()
-        if low.isfinite().all() and high.isfinite().all():
-            middle = (low + high) / 2
-            beyond = ((means - middle) / scale).abs() > SATURATED
-            symptoms["saturated_actions"] = beyond.float().mean().item()
+        beyond = ((means - (low + scale)) / scale).abs() > SATURATED
+        symptoms["saturated_actions"] = beyond.float().mean().item()
     else:
         symptoms["action_diversity"] = _diversity(model, outputs)
     if exploration is not None:
@@ -75,14 +73,13 @@ def acting_symptoms(model: BaseAlgorithm, batch: Batch, outputs: ModelOutputs) -
 
 
 def _bounds(model: BaseAlgorithm) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """Of the actions as the networks give them: least and greatest, and half the range (1 where there are no bounds)."""
+    """Of the actions as the networks give them: least and greatest, and half the range. SB3 takes finite bounds only."""
     space = model.action_space
     assert isinstance(space, spaces.Box)
     low, high = (th.as_tensor(bound.flatten(), device=model.device, dtype=th.float32) for bound in (space.low, space.high))
     if model.policy.squash_output:
         low, high = -th.ones_like(low), th.ones_like(high)
-    half = (high - low) / 2
-    return low, high, th.where(half.isfinite(), half, th.ones_like(half))
+    return low, high, high / 2 - low / 2
 
 
 def _diversity(model: BaseAlgorithm, outputs: ModelOutputs) -> float:
@@ -295,7 +292,8 @@ def policy_change(old: ModelOutputs, new: ModelOutputs, old_std: th.Tensor | Non
     :param new: Outputs after it, on the same batch
     :param old_std: :func:`action_std` before it, of continuous actions
     :param new_std: The same after it
-    :return: KL(old ‖ new) of the policy in nats, mean over the batch; several sub-actions are summed
+    :return: KL(old ‖ new) of the policy in nats, mean over the batch; several sub-actions are summed. Infinite where a standard
+        deviation has become 0 or infinite.
     """
     if old.probabilities is not None and new.probabilities is not None:
         tiny = th.finfo(old.probabilities.dtype).tiny
@@ -303,9 +301,10 @@ def policy_change(old: ModelOutputs, new: ModelOutputs, old_std: th.Tensor | Non
         return terms.flatten(start_dim=1).sum(dim=1).mean().item()
     if old.action_means is None or new.action_means is None or old_std is None or new_std is None:
         return None
-    normal = th.distributions.Normal
-    before, after = normal(old.action_means, old_std), normal(new.action_means, new_std)
-    return th.distributions.kl_divergence(before, after).sum(dim=1).mean().item()
+    before = th.distributions.Normal(old.action_means, old_std, validate_args=False)
+    after = th.distributions.Normal(new.action_means, new_std, validate_args=False)
+    divergence = th.distributions.kl_divergence(before, after).sum(dim=1).mean().item()
+    return math.inf if math.isnan(divergence) else divergence
 
 
 def weight_matrices(model: BaseAlgorithm) -> dict[str, nn.Parameter]:
