@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -28,7 +29,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TrainingCheckpoint, resume
-from sb3_cchain.checkpoint import ResumableEnv, find_checkpoint, load_model
+from sb3_cchain.checkpoint import ResumableEnv, checkpoint_folder, find_checkpoint, load_model, training_checkpoint
 from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.locked_file import open_locked
@@ -405,6 +406,17 @@ def test_a_log_that_cannot_be_made_again(tmp_path):
     go_on(tmp_path, total_timesteps=STEPS + 16, logger=Logger(None, [Record()]))
 
 
+def test_files_are_on_the_disk_before_what_they_replace_is_gone(tmp_path, monkeypatch):
+    events, rmtree = [], shutil.rmtree
+    monkeypatch.setattr(checkpoint_folder, "sync_folder", lambda folder: events.append("folder"))
+    monkeypatch.setattr(training_checkpoint, "sync_files", lambda folder: events.append(folder.name))
+    monkeypatch.setattr(shutil, "rmtree", lambda folder, **kw: (events.append("removed"), rmtree(folder, **kw)))
+    model = make()
+    model.set_logger(configure(str(tmp_path / "logs"), ["csv"]))
+    model.learn(64, TrainingCheckpoint(16, tmp_path / "checkpoints", keep=1))
+    assert events == ["logs", "folder", "logs", "folder", "removed", "logs", "folder", "removed"]
+
+
 # --- Folders of others ---------------------------------------------------------------------------------------------------
 
 
@@ -457,12 +469,48 @@ def test_processes_of_environments_do_not_hold_the_lock(path, tmp_path):
     env.close()
 
 
+def test_one_that_was_refused_does_not_hold_the_lock(path):
+    """While somebody looks at the error, say."""
+    with pytest.raises(ValueError, match="checkpoints of another training") as error:
+        CheckpointFolder(path, 2)
+    CheckpointFolder(path, 2, NEWEST).close()
+    assert error.value.__traceback__ is not None
+
+
 def test_after_an_error_the_same_process_may_train_again(path, tmp_path):
     """In a notebook, say."""
     model = make()
     with pytest.raises(Stopped):
         model.learn(STEPS, [TrainingCheckpoint(32, tmp_path / "new"), Stop(110)])
     assert go_on(tmp_path / "new").num_timesteps == STEPS
+
+
+def test_after_an_error_the_same_callback_may_train_again(tmp_path, handlers):
+    _, are_restored = handlers
+    model, callback = make(), TrainingCheckpoint(32, tmp_path, keep=9)
+    with pytest.raises(Stopped):
+        model.learn(STEPS, [callback, Stop(110)])
+    model.learn(STEPS - 110, [callback, Stop(math.inf)], reset_num_timesteps=False)
+    # 32 steps after the last one, at the start of a rollout
+    assert names(tmp_path) == [f"step_{number:012d}" for number in (32, 64, NEWEST, 142)] and are_restored()
+
+
+def test_after_an_error_in_training_that_went_on(path):
+    checkpoint = find_checkpoint(path)
+    model, callback = load_model(checkpoint, make_env(), "cpu"), TrainingCheckpoint.resume_from(checkpoint)
+    with pytest.raises(Stopped):
+        model.learn(STEPS - NEWEST, [callback, Stop(NEWEST + 5)], reset_num_timesteps=False)
+    model.learn(STEPS - model.num_timesteps, [callback, Stop(math.inf)], reset_num_timesteps=False)
+    assert model.num_timesteps >= STEPS
+
+
+def test_a_link_to_the_folder_is_the_folder(path, tmp_path):
+    (tmp_path / "link").symlink_to(path)
+    checkpoint = find_checkpoint(path)
+    model = load_model(checkpoint, make_env(), "cpu")
+    callback = TrainingCheckpoint.resume_from(checkpoint, tmp_path / "link")
+    model.learn(STEPS - NEWEST, [callback, Stop(math.inf)], reset_num_timesteps=False)
+    assert names(path)[-1] == f"step_{128:012d}"
 
 
 # --- In several calls of learn() -----------------------------------------------------------------------------------------
@@ -502,6 +550,12 @@ def test_a_signal_in_the_last_rollout_of_a_call_stops_the_next_one(tmp_path, han
     assert model.num_timesteps == STEPS
 
 
+def test_a_signal_in_the_last_rollout_stops_no_other_training(tmp_path, handlers):
+    callback = TrainingCheckpoint(10**6, tmp_path)
+    make().learn(64, [callback, Send((60, signal.SIGTERM))])
+    assert make().learn(64, [callback, Send()]).num_timesteps == 64
+
+
 def test_another_training_of_the_same_model_is_refused(tmp_path):
     model = make()
     model.learn(64, TrainingCheckpoint(32, tmp_path))
@@ -521,6 +575,14 @@ def test_it_waits_for_the_log_but_not_too_long(tmp_path, log_interval, saved):
     """Rollouts have 16 steps."""
     make().learn(STEPS, TrainingCheckpoint(48, tmp_path), log_interval=log_interval)
     assert names(tmp_path) == [f"step_{number:012d}" for number in saved]
+
+
+def test_the_log_is_waited_for_in_each_call(tmp_path):
+    """Whose iterations are counted from its beginning."""
+    model, callback = make(), TrainingCheckpoint(48, tmp_path, keep=9)
+    for n_steps in (48, STEPS):
+        model.learn(n_steps, callback, log_interval=2, reset_num_timesteps=False)
+    assert names(tmp_path) == [f"step_{number:012d}" for number in (48, 112, 176)]
 
 
 # --- Damage --------------------------------------------------------------------------------------------------------------
@@ -572,6 +634,14 @@ def test_training_goes_on_from_the_one_before_a_damaged_one(path):
     assert [folder.name for folder in path.glob("damaged*")] == [f"damaged_step_{NEWEST:012d}"]
 
 
+@pytest.mark.filterwarnings("ignore:.*An older checkpoint is taken instead")
+def test_a_step_that_is_damaged_again(path):
+    (path / f"damaged_step_{NEWEST:012d}" / "of an earlier time").mkdir(parents=True)
+    damage(step(path, NEWEST) / "training.pkl", "torn")
+    go_on(path)
+    assert {file.name for file in (path / f"damaged_step_{NEWEST:012d}").iterdir()} >= {"model.zip"}
+
+
 @pytest.mark.parametrize("kind", ["missing", "torn"])
 def test_an_older_damaged_one_does_not_stop_training(dqn_path, kind):
     damage(min(dqn_path.glob("step_*")) / "checkpoint.json", kind)
@@ -583,7 +653,9 @@ def test_an_older_damaged_one_does_not_stop_training(dqn_path, kind):
 def test_the_replay_buffer_is_in_pieces(dqn_path):
     info = find_checkpoint(dqn_path).info
     assert info["chunks"]
-    assert {file.stem for file in (dqn_path / "chunks").rglob("*.z")} >= set(info["chunks"])
+    needed = {name for folder in dqn_path.glob("step_*") for name in find_checkpoint(folder).info["chunks"]}
+    # Pieces of checkpoints that are gone are gone
+    assert {file.stem for file in (dqn_path / "chunks").rglob("*.z")} == needed
 
 
 @pytest.mark.parametrize("kind", ["missing", "torn", "flipped"])
@@ -636,6 +708,16 @@ def test_a_device_that_is_not_here(path):
     message = rf"was trained on cuda:99, which PyTorch does not find here \(.*load {step(path, NEWEST)}/model.zip on another"
     with pytest.raises(ValueError, match=message):
         resume(path, make_env())
+
+
+def test_a_device_without_a_number(path, monkeypatch):
+    """It is the first of its kind."""
+    monkeypatch.setattr(th, "empty", lambda *_, **__: None)  # as where there is one
+    change_info(step(path, NEWEST), device="cuda:0")
+    checkpoint = find_checkpoint(path)
+    assert checkpoint.device("cuda") == th.device("cuda:0")
+    with pytest.raises(ValueError, match=r"`device` must be cuda:0.*got cuda:1"):
+        checkpoint.device("cuda:1")
 
 
 def test_a_changed_number_is_noticed(path):
@@ -857,6 +939,17 @@ def test_new_episodes_where_exactness_is_not_wanted(tmp_path):
     assert abs(state - observation).max() < 1e-6 and abs(state).max() <= 0.05 and starts.all()
 
 
+@pytest.mark.filterwarnings("ignore:All environments begin new episodes")
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_checkpoint_says_whether_it_is_exact(tmp_path, exact):
+    """Not the callback that goes on from it."""
+    train(make(), tmp_path, exact=exact)
+    callbacks = [TrainingCheckpoint(32, tmp_path, exact=not exact), Stop(math.inf)]
+    model, expected = resume(tmp_path, make_env(), callbacks, device="cpu"), make().learn(STEPS)
+    are_equal = all(map(th.equal, parameters(model), parameters(expected)))
+    assert model.num_timesteps == STEPS and are_equal is exact
+
+
 @pytest.mark.parametrize("wrapper", [VecNormalize, TaskVecNormalize])
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_tasks_and_statistics_outlast_episodes(tmp_path, wrapper, vec_env_cls):
@@ -904,6 +997,16 @@ class Send(BaseCallback):
         return True
 
 
+class AtStart(BaseCallback):
+    """A signal to this process when training starts."""
+
+    def _on_training_start(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def _on_step(self):
+        return True
+
+
 @pytest.fixture
 def handlers():
     """Of the process, in the place of those of the interpreter."""
@@ -935,6 +1038,24 @@ def test_a_signal_saves_and_stops(tmp_path, capsys, handlers, create, number, er
     resumed = resume(tmp_path, make_env(), [TrainingCheckpoint(10**6, tmp_path), Send()], device="cpu")
     assert resumed.num_timesteps == STEPS and are_restored()
     assert_same(resumed, create().learn(STEPS))
+
+
+def test_a_signal_before_anything_is_trained(tmp_path, handlers):
+    """Twice, as one who starts it again and stops it again."""
+    model, callback = make(), TrainingCheckpoint(10**6, tmp_path)
+    model.learn(64, callback)
+    for _ in range(2):
+        with pytest.raises(SystemExit):
+            model.learn(64, [callback, AtStart()], reset_num_timesteps=False)
+        assert names(tmp_path) == [f"step_{64:012d}"]
+
+
+def test_a_signal_in_an_episode_that_was_not_recorded(tmp_path, capsys, handlers):
+    env = make_env("LunarLander-v3")
+    model = make(env).learn(16)  # without the callback, so that the episode is under way
+    with pytest.raises(SystemExit):
+        model.learn(64, [TrainingCheckpoint(16, tmp_path), Send((20, signal.SIGTERM))], reset_num_timesteps=False)
+    assert names(tmp_path) == [] and "There is no checkpoint" in capsys.readouterr().out
 
 
 def test_a_signal_that_is_ignored_stays_ignored(tmp_path, handlers):
