@@ -124,6 +124,10 @@ def test_isolated_changes_of_negative_returns_and_of_none():
     assert changes[:, 0] == pytest.approx([1.0, -0.6]) and np.isnan(changes[:, 1]).all()
 
 
+def test_isolated_changes_without_a_scale():
+    assert np.isnan(continual.isolated_changes([-1.0], [[0.0]])).all()
+
+
 def test_recovery_is_to_the_last_five_rollouts():
     values = [100.0] * 3 + [1.0] * 5
     rows = [dict(timesteps=10 * i, task_id=0, n_episodes=1, mean_return=value) for i, value in enumerate(values)]

@@ -82,6 +82,16 @@ def test_one_seed_determines_the_whole_sequence():
     assert all((first[first.astype(int) == task] != second[second.astype(int) == task]).all() for task in range(3))
 
 
+def test_a_seed_is_that_of_tasks_that_were_seen_before():
+    env, seen = three_tasks(), []
+    for _ in range(2):
+        env.set_task(0)
+        env.reset(seed=1)
+        env.set_task(1)
+        seen.append(env.reset()[0])
+    assert np.array_equal(*seen)
+
+
 def test_vectorised_environments_are_told_to_switch_together():
     env = three_tasks(n_envs=5)
     assert [task for task, *_ in walk(env, 6)] == [0, 0, 1, 1, 2, 2]

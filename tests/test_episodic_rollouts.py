@@ -71,6 +71,13 @@ def test_the_last_value_is_that_of_the_last_observation():
     assert np.array_equal(*targets) and targets[0][9, 0] != pytest.approx(1, abs=0.1)
 
 
+def test_there_is_no_value_after_an_episode_that_has_ended():
+    spy = Spy()
+    model = PPO("MlpPolicy", CountEnv(length=5), n_steps=10, batch_size=5, normalize_advantage=False, gamma=1.0, device="cpu")
+    model.learn(10, [EpisodicRollouts(), spy])
+    assert spy.rollouts[0][2][:, 0].tolist() == [5, 4, 3, 2, 1] * 2
+
+
 def test_recurrent_policies_are_refused():
     with pytest.raises(TypeError, match="EpisodicRollouts does not know recurrent networks, got RecurrentPPO"):
         RecurrentPPO("MlpLstmPolicy", CountEnv(), normalize_advantage=False).learn(8, EpisodicRollouts())

@@ -198,6 +198,42 @@ def test_training_that_ends_at_a_switch_has_the_statistics_of_its_task():
     assert callback.counts == [1, 32, 32]
 
 
+def test_an_evaluation_leaves_its_statistics():
+    class Watch(Means):
+        def _all_returns(self):
+            returns = super()._all_returns()
+            assert round(self.eval_env.obs_rms.count) == self.counts[-1]
+            return returns
+
+    env, eval_env = (TaskVecNormalize(make_vec_env(tasks)) for _ in range(2))
+    callback = Watch(eval_env, n_eval_episodes=1)
+    PPO("MlpPolicy", env, **ARGUMENTS).learn(48, [TaskSync(), callback])
+    assert len(callback.counts) == 3
+
+
+@pytest.mark.parametrize("interval", [None, 50])
+def test_resumed_in_the_middle_of_an_interval(tmp_path, interval):
+    """There is no evaluation at the start. Rows of training that was lost after the last save will come again."""
+    model = CChainPPO("MlpPolicy", tasks(), **ARGUMENTS)
+    model.learn(64, callback=EvalAllTasks(tasks(), n_eval_episodes=1, interval=interval))
+    rows = [*model.task_returns]
+    model.task_returns += [{**row, "timesteps": 80} for row in rows[:3]]
+    model.save(tmp_path / "model")
+    loaded = CChainPPO.load(tmp_path / "model", env=tasks(), device="cpu")
+    loaded.learn(32, callback=EvalAllTasks(tasks(), n_eval_episodes=1, interval=interval), reset_num_timesteps=False)
+    assert loaded.task_returns[: len(rows)] == rows
+    assert [row["timesteps"] for row in loaded.task_returns[len(rows) :]] == [96] * 3
+
+
+def test_tasks_that_were_left_out_are_not_forgotten():
+    record = Record()
+    model = CChainPPO("MlpPolicy", tasks(first_task=1), **ARGUMENTS)
+    model.set_logger(Logger(None, [record]))
+    model.learn(64, callback=EvalAllTasks(tasks(first_task=1), n_eval_episodes=1), log_interval=1)
+    forgotten = [row["continual_eval/forgetting"] for _, row in record.rows if "continual_eval/forgetting" in row]
+    assert forgotten == [0.0]
+
+
 def test_resumed_training_goes_on_with_the_rows(tmp_path):
     model, rows = evaluate(tmp_path / "all.csv", total=64)
     model.save(tmp_path / "model")

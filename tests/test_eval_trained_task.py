@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask
@@ -11,7 +13,7 @@ from sb3_cchain.callbacks import read_returns
 from sb3_cchain.tensorboard.layout import layout_of
 from tests.envs import CountEnv
 from tests.resume_cases import Record
-from tests.test_eval_all_tasks import ARGUMENTS, tasks
+from tests.test_eval_all_tasks import ARGUMENTS, CARTPOLE, tasks
 
 
 def test_evaluates_before_training_at_intervals_and_right_after_each_task(tmp_path):
@@ -74,6 +76,25 @@ class Recorded(CountEnv):
 
 
 Recorded.__name__ = "CountEnv"  # the same tasks as those of training
+
+
+def test_the_environment_is_normalised_within_the_limits_of_training():
+    env = VecNormalize(make_vec_env("Continual/CartPole-v1", env_kwargs=CARTPOLE), clip_obs=0.5, epsilon=1e-3)
+    callback = EvalTrainedTask(n_eval_episodes=1)
+    PPO("MlpPolicy", env, **ARGUMENTS).learn(16, [TaskSync(), callback])
+    assert (callback.eval_env.clip_obs, callback.eval_env.epsilon) == (0.5, 1e-3)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_mode_of_the_network_is_left_as_it_is(training):
+    callback, model = EvalTrainedTask(tasks()), PPO("MlpPolicy", tasks(), **ARGUMENTS)
+    model.set_logger(Logger(None, []))
+    callback.init_callback(model)
+    model.policy.set_training_mode(training)
+    model.env.reset()
+    callback.on_training_start({}, {})
+    callback.on_rollout_start()
+    assert len(model.evaluations) == 1 and model.policy.training is training
 
 
 def evaluate(**arguments):

@@ -267,6 +267,65 @@ def test_an_episode_that_goes_on_over_calls_of_learn_is_whole(algorithm):
     assert [row["mean_return"] for row in metrics.rows] == [24, 24]
 
 
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+def test_an_environment_that_was_reset_has_a_new_episode(algorithm):
+    env = DummyVecEnv([lambda: CountEnv(length=20)])
+    metrics, model = ContinualMetrics(), make_model(algorithm, env)
+    model.learn(16, metrics)
+    model.set_env(env)
+    model.learn(24, metrics, reset_num_timesteps=False)
+    assert [row["mean_return"] for row in metrics.rows if row["n_episodes"]] == [20.0]
+
+
+def test_the_return_of_a_monitor_is_taken():
+    """Which also knows of a reset that is not at the end of an episode."""
+
+    class ResetByHand(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 10:
+                self.training_env.envs[0].reset()
+            return True
+
+    metrics = ContinualMetrics()
+    PPO("MlpPolicy", CountEnv(length=20), **SETTINGS).learn(32, [metrics, ResetByHand()])
+    assert [row["mean_return"] for row in metrics.rows if row["n_episodes"]] == [20.0]
+
+
+def test_steps_of_all_environments_count():
+    metrics = ContinualMetrics()
+    PPO("MlpPolicy", make_vec_env(never_ending, 2), **SETTINGS).learn(32, metrics)
+    assert [row["mean_return"] for row in metrics.rows] == [1.0]
+
+
+def test_rows_that_were_lost_come_again(tmp_path):
+    """After a save, of which the file of a killed training has more."""
+    model = PPO("MlpPolicy", make_env(), **SETTINGS).learn(32, [TaskSync(), ContinualMetrics()])
+    model.continual_returns.append({"timesteps": 48, "task_id": 1, "n_episodes": 2, "mean_return": -1.0})
+    model.learn(32, [TaskSync(), ContinualMetrics()], reset_num_timesteps=False)
+    assert [(row["timesteps"], row["mean_return"]) for row in model.continual_returns] == [
+        (16, 8),
+        (32, 8),
+        (48, 16),
+        (64, 16),
+    ]
+
+
+def test_reward_per_step_is_of_one_rollout():
+    spy = Spy()
+    CChainPPO("MlpPolicy", ContinualEnv([lambda: Rising(length=16)] * 2, 64), **SETTINGS).learn(48, spy)
+    assert [row["reward_per_step"] for row in spy.logged] == [1, 2, 3]
+
+
+def test_the_file_is_as_it_was_when_training_goes_on(tmp_path):
+    row = {"timesteps": 8, "task_id": 0, "n_episodes": 1, "mean_return": 3.0}
+    file = ReturnsFile(tmp_path / "r.csv", [row], keep_old=False)
+    state = file.state_dict()
+    file.append([row])
+    file.load_state_dict(state)
+    file.close()
+    assert read_returns(tmp_path / "r.csv") == [row]
+
+
 def test_one_environment_after_the_other(tmp_path):
     path, spy = tmp_path / "returns.csv", Spy()
     worlds = [never_ending(), CountEnv(length=8, reward=2.0), VecNormalize(make_vec_env(never_ending))]

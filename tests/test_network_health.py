@@ -475,6 +475,12 @@ def test_interval(name, interval, acted_at):
     assert len(again.acted_at) == 1
 
 
+def test_the_interval_counts_calls_of_train_with_several_environments_too():
+    health = SpyHealth(interval=3)
+    make_model("PPO", make_vec_env(make_random_env, 2)).learn(192, callback=health)
+    assert [step for step, _ in health.acted_at] == [32, 96, 192]
+
+
 @pytest.mark.parametrize("name, interval", [("PPO", 10), ("DQN", 1000)])
 def test_default_interval(name, interval):
     health = NetworkHealth()

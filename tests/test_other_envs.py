@@ -388,6 +388,11 @@ def test_maskable_ppo_takes_the_tasks_own_actions_alone():
             "needs actions that are Discrete or a bounded one-dimensional Box, .* has MultiBinary",
         ),
         (
+            lambda: CommonSpaces(RandomEnv(action_space=spaces.Box(-1, np.inf, (1,))), 4, 4),
+            TypeError,
+            "needs actions that are Discrete or a bounded one-dimensional Box, .* has Box",
+        ),
+        (
             lambda: CommonSpaces(RandomEnv(spaces.Sequence(spaces.Discrete(2))), 4, 3),
             TypeError,
             "needs observations that can be",

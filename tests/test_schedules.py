@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_cchain import CChainPPO, ContinualMetrics, DoubleDQN, TaskSignal, TrainingCheckpoint, resume
 from sb3_cchain.callbacks import OverallSchedule, TaskSchedule
+from sb3_cchain.callbacks.replaced_methods import wrapped
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods import ExplorationRateRestart
 from tests.envs import CountEnv
@@ -80,6 +81,15 @@ def test_each_task_begins_its_schedule_again(chunks):
     assert rates.rates == pytest.approx({16: 5e-4, 32: 0, 48: 0, 64: 5e-4, 80: 0, 96: 0})
 
 
+def test_another_training_begins_its_first_task_again():
+    model = make(PPO)
+    for _ in range(2):
+        rates = Rates()
+        model.learn(64, [TaskSignal(switch_at=[48]), TaskSchedule(32), rates])
+        rates.rates.pop(0, None)  # of the training before
+        assert rates.rates == pytest.approx({16: 5e-4, 32: 0, 48: 0, 64: 5e-4})
+
+
 def test_exploration_begins_again_with_the_task():
     model, rates = make(DQN, exploration_fraction=0.5), []
 
@@ -139,6 +149,32 @@ def test_beside_a_callback_that_replaces_the_method_by_hand(is_last):
     model, callbacks = make(DQN), [TaskSignal(switch_at=[16]), ExplorationRateRestart(), WrapAsUsersDo()]
     model.learn(48, callbacks if is_last else [callbacks[2], *callbacks[:2]])
     assert model.num_timesteps == 48 and model._n_calls == 48
+
+
+def wrapper(order, name):
+    return lambda call: (order.append(name), call())[1]
+
+
+def test_the_last_wrapper_comes_first_and_the_innermost_one_last():
+    class Owner:
+        def method(self):
+            order.append("method")
+
+    owner, order = Owner(), []
+    with (
+        wrapped(owner, "method", wrapper(order, "first")),
+        wrapped(owner, "method", wrapper(order, "second")),
+        wrapped(owner, "method", wrapper(order, "innermost"), innermost=True),
+    ):
+        owner.method()
+    assert order == ["second", "first", "innermost", "method"] and vars(owner) == {}
+
+
+def test_what_the_user_puts_in_the_place_of_a_method_stays():
+    model = make(PPO)
+    with wrapped(model, "get_vec_normalize_env", lambda call: call()):
+        model.get_vec_normalize_env = own = lambda: None
+    assert model.get_vec_normalize_env is own
 
 
 def test_two_that_watch_the_same_method():

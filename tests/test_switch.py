@@ -34,6 +34,8 @@ def test_the_clock_counts_the_steps_of_all_environments():
 def test_the_clock_begins_with_the_first_task():
     clock = TaskClock([4, 2, 4], first_task=1)
     assert (clock.task_id, clock.due_task, clock.first_task) == (1, 1, 1)
+    clock.advance()
+    assert clock.n_steps == 1
     clock.set(2)
     assert clock.due_task == 2
 
@@ -119,6 +121,15 @@ def test_training_that_goes_on_without_task_sync_is_warned_of(tmp_path, algorith
     model = ALGORITHMS[algorithm].func.load(tmp_path / "model", env=make_env(), device="cpu")
     with pytest.warns(UserWarning, match=r"are at step 0, but training is at step 4\d.*TaskSync"):
         model.learn(16, callback=cls(), reset_num_timesteps=False)
+
+
+@FOLLOWERS
+def test_a_new_model_in_an_environment_that_goes_on_is_not_warned_of(algorithm, cls):
+    env = make_env()
+    make_model(algorithm, env).learn(40, callback=TaskSync())
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The continual environments")
+        make_model(algorithm, env).learn(16, callback=cls())
 
 
 @FOLLOWERS

@@ -366,6 +366,14 @@ def test_environments_whose_task_is_not_told():
     assert env.obs_rms.count == pytest.approx(42, abs=1e-3)
 
 
+def test_a_switch_that_a_signal_did_not_tell_is_not_heard_later():
+    env = TaskVecNormalize(make_sequence(steps_per_task=16))
+    model = CChainPPO("MlpPolicy", env, **SETTINGS).learn(32, TaskSignal(switch_at=[1000]))
+    model.learn(16, reset_num_timesteps=False)
+    # The third task has begun at step 32
+    assert env.obs_rms.count == pytest.approx(49, abs=1e-3)
+
+
 def test_the_first_transition_after_a_sync_is_of_the_task_that_is_due():
     envs = [VecNormalize(make_vec_env(make_env, 1)) for _ in range(2)]
     model = DQN("MlpPolicy", envs[0], device="cpu", seed=0, **OFF_POLICY).learn(40, TaskSync())

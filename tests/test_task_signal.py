@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from sb3_cchain import CChainCallback, ContinualMetrics, TaskSignal, TrainingCheckpoint, resume, task_switched
 from sb3_cchain.analysis.inspection import inspect_model
@@ -374,6 +374,50 @@ def test_environments_side_by_side(kwargs):
     assert oracle.n_resets == 1
 
 
+@pytest.mark.parametrize("source", [dict(key="level"), dict(attribute="level"), dict(switch_every=SWITCH)])
+def test_methods_act_before_the_first_step_of_the_new_world(source):
+    """Of one that changes between two rollouts, where an episode ends."""
+    oracle, heard = Oracle(), []
+    model = make_model("PPO", World())
+    oracle._on_task_switch = lambda: heard.append(model.num_timesteps)
+    model.learn(SWITCH + 16, [TaskSignal(**source), oracle])
+    assert heard == [SWITCH]
+
+
+@pytest.mark.parametrize("step, expected", [(0, 32), (16, 32), (32, 64)])
+@pytest.mark.parametrize("arguments", [dict(switch_every=32), dict(switch_at=[32, 64])], ids=["every", "at"])
+def test_the_next_switch(arguments, step, expected):
+    signal = TaskSignal(**arguments)
+    signal.num_timesteps = step
+    assert signal.next_switch == expected
+
+
+def test_a_training_that_begins_anew_begins_with_task_0():
+    model, signal = make_model("PPO", CountEnv()).learn(32, TaskSignal(switch_at=[16])), TaskSignal()
+    model.learn(16, signal)
+    assert signal.next_task == 0
+
+
+@pytest.mark.parametrize("with_metrics", [True, False])
+def test_an_episode_that_goes_on_is_no_new_world(with_metrics):
+    model, callbacks = make_model("PPO", long_world()), [ContinualMetrics()] if with_metrics else []
+    for _ in range(4):
+        signal = TaskSignal(key="level")
+        model.learn(16, [signal, *callbacks], reset_num_timesteps=False)
+    assert signal.next_task == 1
+
+
+def test_a_reset_between_calls_of_learn_is_heard():
+    """Into a world that changed meanwhile."""
+    model, world = make_model("PPO", long_world()), long_world()
+    model.learn(16, TaskSignal(key="level"))
+    world.level, signal, tasks = "hard", TaskSignal(key="level"), []
+    model.set_env(world)
+    look = Curriculum(lambda _: tasks.append(signal.step_task), at=17)
+    model.learn(16, [signal, look], reset_num_timesteps=False)
+    assert tasks == [1]
+
+
 def test_a_switch_in_the_middle_of_an_episode_is_heard_at_the_next_rollout():
     oracle, heard = Oracle(), []
     model = make_model("DQN", CountEnv(length=10**6))
@@ -450,6 +494,14 @@ def test_drift_of_a_logged_value():
     model.learn(80, [signal, Spy()])
     assert heard == losses[1:] and len(heard) == 4
     assert signal.next_task == 1
+
+
+def test_the_returns_of_all_environments_are_watched():
+    signal, heard = TaskSignal(drift="adwin"), []
+    signal._detector = SimpleNamespace(update=heard.append, reset=lambda: None)
+    envs = VecMonitor(DummyVecEnv([lambda length=length: CountEnv(length=length) for length in (1000, 2)]))
+    make_model("PPO", envs, n_steps=8).learn(16, signal)
+    assert heard == [2.0] * 4
 
 
 @pytest.mark.parametrize("reason", ["drift", "call"])
