@@ -119,13 +119,15 @@ def test_training_that_was_killed_goes_on_exactly(tmp_path, at_step, algo, cls, 
     assert not list((run_folder(tmp_path, 4, algo) / "checkpoints").glob("step_*"))
 
 
-def test_the_best_model_and_evaluations_come_along(tmp_path):
-    train(tmp_path, "--checkpoint-freq", 32)
-    finished = run_folder(tmp_path, 1)
+def test_the_best_model_and_evaluations_come_along(tmp_path, at_step):
+    """At once, in case that the training is killed before the next evaluation."""
+    params = (*SHORT_PPO, "normalize:True")
+    train(tmp_path, "--checkpoint-freq", 32, params=params)
+    finished, come = run_folder(tmp_path, 1), []
+    at_step(161, lambda: come.extend(run_folder(tmp_path, 2).rglob("*.*")))
     # Though the training is finished, one may go on from a checkpoint of it
-    train(tmp_path, "--resume", finished / "checkpoints" / "step_000000000160")
-    for name in ("evaluations.npz", "best_model.zip"):
-        assert (run_folder(tmp_path, 2) / name).exists()
+    train(tmp_path, "--resume", finished / "checkpoints" / "step_000000000160", params=params)
+    assert {"evaluations.npz", "best_model.zip", "vecnormalize.pkl"} <= {path.name for path in come}
     steps = np.load(run_folder(tmp_path, 2) / "evaluations.npz")["timesteps"].tolist()
     assert steps == [48, 96, 144, 192]
 
@@ -178,7 +180,13 @@ def checkpoints(tmp_path_factory):
         (dict(algo="ppo"), r"had --algo ppo_cchain, not ppo; .*target_churn_ratio 10000.0, not None"),
         (dict(params=(*SHORT_PPO, "gamma:0.5")), r"had gamma 0.99, not 0.5\. Give"),
         (dict(params=(*SHORT_PPO[:-1], "policy_kwargs:dict(net_arch=[9])")), r"had policy_kwargs {'net_arch': \[8\]}, not "),
+        (dict(params=(*SHORT_PPO, "target_kl:0.3")), r"had target_kl None, not 0.3\. Give"),
         (dict(evaluation=EVALUATION), r"had --eval-freq -1, not 48; --eval-episodes 5, not 2"),
+        (dict(evaluation=(*NO_EVALUATION, "--save-freq", "32")), r"had --save-freq -1, not 32\. Give"),
+        (
+            dict(evaluation=(*NO_EVALUATION, "--eval-env-kwargs", "n_tasks:3")),
+            r"had --eval-env-kwargs None, not {'n_tasks': 3}\. Give",
+        ),
     ],
 )
 def test_another_training_is_refused(checkpoints, tmp_path, changes, message):

@@ -8,14 +8,15 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.save_util import load_from_pkl
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, unwrap_vec_normalize
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.checkpoint import saved_timesteps
-from sb3_cchain.zoo.experiment import make_run_folder, statistics_path
+from sb3_cchain.zoo.experiment import ExperimentManager, make_run_folder, statistics_path
+from tests.envs import CountEnv
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
 ENV = "Continual/CartPole-v1"
@@ -181,6 +182,24 @@ def test_normalize_is_restarted_at_each_task_unless_the_settings_say_otherwise(t
         statistics = load_from_pkl(run_folder(tmp_path, number) / NAME / "vecnormalize.pkl")
         assert statistics.obs_rms.count == pytest.approx(count, abs=1e-3)
         assert statistics.gamma == 0.99 and statistics.norm_reward
+
+
+@pytest.mark.parametrize("eval_env", [False, True])
+def test_evaluations_leave_statistics_and_rewards_as_they_are(eval_env):
+    manager = object.__new__(ExperimentManager)
+    manager.normalize, manager.normalize_kwargs = True, {"norm_reward": True, "clip_obs": 5.0}
+    env = manager._maybe_normalize(DummyVecEnv([CountEnv]), eval_env)
+    assert (env.training, env.norm_reward, env.clip_obs) == (not eval_env, not eval_env, 5.0)
+
+
+def test_an_evaluation_of_the_settings_keeps_its_own_files(tmp_path):
+    """That of the command line saves the best model more safely."""
+    (tmp_path / "best").mkdir()
+    own = EvalCallback(DummyVecEnv([CountEnv]), best_model_save_path=str(tmp_path / "best"))
+    manager = object.__new__(ExperimentManager)
+    vars(manager).update(callbacks=[own], checkpoints=None, show_progress=False, save_freq=-1, eval_freq=-1)
+    manager.create_callbacks()
+    assert manager.callbacks == [own] and own.best_model_save_path == str(tmp_path / "best")
 
 
 # --- Folders --------------------------------------------------------------------------------------------------------------

@@ -56,10 +56,10 @@ def test_the_table_fits_a_terminal():
     assert name == "MiniGrid-DoorKey-16x16-v0" and max(map(len, shown)) <= 80
 
 
-def train(folder, capsys, env, *arguments):
+def train(folder, capsys, env, *arguments, params=()):
     command(
         *("train", "--algo", "ppo_cchain", "--env", env, "-f", folder / "logs", "--seed", "0", *FAST, *NO_EVALUATION),
-        *(*arguments, *SHORT_PPO),
+        *(*arguments, *SHORT_PPO, *params),
     )
     lines = capsys.readouterr().out.splitlines()
     return lines[next(number for number, line in enumerate(lines) if line.startswith("ppo_cchain in")) :]
@@ -87,6 +87,14 @@ def test_the_end_of_training(tmp_path, capsys):
         "See curves": f"tensorboard --logdir {tmp_path}/tb",
     }
     command(*shlex.split(where["Watch it"])[1:], "--no-render", "-n", 5)
+
+
+def test_tasks_of_a_signal_have_its_numbers(tmp_path, capsys):
+    """And not the names of the environment's own."""
+    callbacks = "callback:['sb3_cchain.TaskSync', {'sb3_cchain.TaskSignal': dict(switch_at=[96])}]"
+    options = ("-n", 160, "--env-kwargs", "n_tasks:2", "steps_per_task:64")
+    shown = train(tmp_path, capsys, "Continual/CartPole-v1", *options, params=[callbacks])
+    assert [line.split("|")[1:3] for line in shown[4:6]] == [["    0 ", "    96 "], ["    1 ", "    64 "]]
 
 
 def test_the_end_of_training_without_tasks(tmp_path, capsys):

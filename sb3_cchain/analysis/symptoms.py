@@ -292,8 +292,8 @@ def policy_change(old: ModelOutputs, new: ModelOutputs, old_std: th.Tensor | Non
     :param new: Outputs after it, on the same batch
     :param old_std: :func:`action_std` before it, of continuous actions
     :param new_std: The same after it
-    :return: KL(old ‖ new) of the policy in nats, mean over the batch; several sub-actions are summed. Infinite where a standard
-        deviation has become 0 or infinite.
+    :return: KL(old ‖ new) of the policy in nats, mean over the batch; several sub-actions are summed. Infinite where a
+        standard deviation has become 0 or infinite.
     """
     if old.probabilities is not None and new.probabilities is not None:
         tiny = th.finfo(old.probabilities.dtype).tiny

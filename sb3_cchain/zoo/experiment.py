@@ -143,7 +143,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         done, final = checkpoint.num_timesteps, checkpoint.folder.parent / f"{self.env_name}.zip"
         # One who names a checkpoint wants to go on from there in any case
         if checkpoint.path != self.checkpoints.resume and final.is_file():
-            done = max(done, saved_timesteps(final))
+            done = saved_timesteps(final)
         if done >= self.n_timesteps:
             print(
                 f"The training in {checkpoint.folder.parent} is finished: it made {done} of {self.n_timesteps} steps. "
