@@ -1,16 +1,16 @@
 """Churn reduction of an on-policy algorithm's unmodified ``train()``: where the gradient goes in, and what is logged."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_cchain.algorithms.churn_log import log_churn
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.last_surrogate import last_surrogate
 from sb3_cchain.algorithms.recorded import recorded
@@ -125,13 +125,10 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         reducer.discard_losses()  # of an iteration that was interrupted
         coefs[name] = reducer.coefficient.value
     acting = partial(evaluation_mode, policy) if has_training_mode(policy) else nullcontext
-    watches_values = list(reducers) == ["policy"] and isinstance(references, ReferenceBatches)
-    old_values: th.Tensor | None = None
     value_churns: list[float] = []
-
-    def values_of(reference: Observations) -> th.Tensor:
-        with th.no_grad():
-            return policy.predict_values(rows(reference, slice(VALUE_CHURN_SAMPLES)))
+    watching: Callable[[], AbstractContextManager[None]] = nullcontext
+    if list(reducers) == ["policy"] and isinstance(references, ReferenceBatches):
+        watching = _ValueWatch(policy, reducers["policy"], references, value_churns).between_updates
 
     def hold_still(name: str, backward: Callable[[th.Tensor], object] = th.Tensor.backward) -> None:
         reducer, target = reducers[name], targets[name]
@@ -146,13 +143,9 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
             value_churns.append(mean_absolute_change(old, new.detach()))
 
     def before_update(adders: Mapping[str, Callable[[], None]]) -> None:
-        nonlocal old_values
-        with acting():
-            if old_values is not None:
-                value_churns.append(mean_absolute_change(old_values, values_of(reducers["policy"].reference)))  # type: ignore
+        with acting(), watching():
             for add_gradient in adders.values():
                 add_gradient()
-            old_values = values_of(references.current) if watches_values and references.starts_epoch else None  # type: ignore
 
     with ExitStack() as stack:
         adders: dict[str, Callable[[], None]] = {name: partial(hold_still, name) for name in reducers}
@@ -172,10 +165,41 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
             reducer.next_reference = references.current
         if reducer.losses:
             loss = _take_losses(model, logged, targets[name], reducer, options, surrogate)
-            _log(model.logger, name, "churn" if len(reducers) == 1 else f"churn/{name}", reducer, coefs[name], loss)
+            prefix = "churn" if len(reducers) == 1 else f"churn/{name}"
+            log_churn(model.logger.record, prefix, coefs[name], float(np.mean(reducer.losses)), loss)
+            if name == "policy":
+                model.logger.record("churn/policy_churn", reducer.mean_churn())
             reducer.end_iteration(loss)
     if value_churns:
         model.logger.record("churn/value_churn", np.mean(value_churns))
+
+
+class _ValueWatch:
+    """
+    Measures the churn of values that are not held still, by the first update of each epoch, unless no update follows it.
+
+    :param policy: The policy
+    :param reducer: That of the policy's outputs
+    :param references: Where its reference batches come from
+    :param churns: What is measured is appended to it
+    """
+
+    def __init__(self, policy: ActorCriticPolicy, reducer: ChurnReducer, references: ReferenceBatches, churns: list[float]):
+        self._policy, self._reducer, self._references, self._churns = policy, reducer, references, churns
+        self._old_values: th.Tensor | None = None
+
+    @contextmanager
+    def between_updates(self) -> Iterator[None]:
+        """In the block the reducer goes on from the reference batch of the update before to that of the next one."""
+        if self._old_values is not None:
+            self._churns.append(mean_absolute_change(self._old_values, self._values_of(self._reducer.reference)))
+        yield
+        self._old_values = self._values_of(self._references.current) if self._references.starts_epoch else None
+
+    def _values_of(self, reference: Observations | None) -> th.Tensor:
+        assert reference is not None
+        with th.no_grad():
+            return self._policy.predict_values(rows(reference, slice(VALUE_CHURN_SAMPLES)))
 
 
 def _take_losses(
@@ -191,12 +215,3 @@ def _take_losses(
         return abs(target.base_loss(model, logged, without_entropy=options.churn_base_loss == "surrogate"))
     reducer.losses = reducer.losses[-1:]
     return abs(surrogate())
-
-
-def _log(logger: Logger, name: str, prefix: str, reducer: ChurnReducer, coef: float, loss: float) -> None:
-    churn_loss = np.mean(reducer.losses)
-    logger.record(f"{prefix}/loss", churn_loss)
-    logger.record(f"{prefix}/coef", coef)
-    logger.record(f"{prefix}/relative_loss", coef * churn_loss / (loss + 1e-8))
-    if name == "policy":
-        logger.record("churn/policy_churn", reducer.mean_churn())

@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_cchain.algorithms.churn_log import log_churn
 from sb3_cchain.churn.divergence import action_changes, mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.policy_inputs import joined, n_observations
@@ -88,9 +89,7 @@ def log_q_churn(logger: Logger, coef: float, churn_loss: float, td_loss: float, 
     :param old: Action values of the reference batch before an update, ``(batch_size, n_actions)``
     :param new: Action values of the same batch after it
     """
-    logger.record_mean("churn/loss", churn_loss)
-    logger.record_mean("churn/coef", coef)
-    logger.record_mean("churn/relative_loss", coef * churn_loss / (td_loss + 1e-8))
+    log_churn(logger.record_mean, "churn", coef, churn_loss, td_loss)
     logger.record_mean("churn/value_churn", mean_absolute_change(old, new))
     logger.record_mean("churn/greedy_action_changes", action_changes(old.argmax(dim=1), new.argmax(dim=1)))
 
