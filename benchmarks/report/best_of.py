@@ -83,27 +83,22 @@ def best_strengths(suite: str, cells: Cells, env_ids: Sequence[str]) -> list[Bes
     :return: The best strength of each method that has runs with another one than is shipped
     """
     methods = lines_in_order(split_line(line)[0] for _, line in cells if "@" in line)
-    found = []
-    for env_id in env_ids:
-        for method in methods:
-            by_strength: dict[str, Cell] = {}
-            shipped = None
-            for (name, line), cell in cells.items():
-                if name != env_id or split_line(line)[0] != method:
-                    continue
-                strength = strength_of(cell.results[0])
-                if line == method:
-                    shipped = strength
-                # The shipped strength under its own name is the same method
-                if line == method or strength not in by_strength:
-                    by_strength[strength] = cell
-            seeds = sorted(set.intersection(*(set(cell.seeds) for cell in by_strength.values()))) if by_strength else []
-            if seeds:
-                means = _means(by_strength, seeds)
-                by_strength = {strength: by_strength[strength] for strength in sorted(by_strength, key=float)}
-                best = max(by_strength, key=means.__getitem__)
-                found.append(Best(suite, env_id, method, by_strength, seeds, best, shipped))
-    return found
+    found = (_best(suite, cells, env_id, method) for env_id in env_ids for method in methods)
+    return [best for best in found if best is not None]
+
+
+def _best(suite: str, cells: Cells, env_id: str, method: str) -> Best | None:
+    of_method = {line: cell for (name, line), cell in cells.items() if name == env_id and split_line(line)[0] == method}
+    shipped = strength_of(of_method[method].results[0]) if method in of_method else None
+    by_strength = {strength_of(cell.results[0]): cell for cell in of_method.values()}
+    if shipped is not None:
+        by_strength[shipped] = of_method[method]  # under its own name it is the same method
+    by_strength = {strength: by_strength[strength] for strength in sorted(by_strength, key=float)}
+    seeds = sorted(set.intersection(*(set(cell.seeds) for cell in by_strength.values()))) if by_strength else []
+    if not seeds:
+        return None
+    means = _means(by_strength, seeds)
+    return Best(suite, env_id, method, by_strength, seeds, max(by_strength, key=means.__getitem__), shipped)
 
 
 def best_table(found: Sequence[Best], paper: Table) -> str:
