@@ -521,11 +521,9 @@ def test_a_look_sees_what_its_own_training_did():
 def test_a_look_that_was_interrupted_is_forgotten(monkeypatch):
     model, doctor, looked_at = make(PPO), Doctor(interval=1), []
     monkeypatch.setattr(doctor, "_log", lambda: looked_at.append(doctor.num_timesteps))
-    monkeypatch.setattr(model, "train", lambda: (_ for _ in ()).throw(Stopped))
-    with pytest.raises(Stopped):
+    with monkeypatch.context() as patched, pytest.raises(Stopped):
+        patched.setattr(model, "train", lambda: (_ for _ in ()).throw(Stopped))
         model.learn(64, callback=doctor)
-    monkeypatch.undo()
-    monkeypatch.setattr(doctor, "_log", lambda: looked_at.append(doctor.num_timesteps))
     model.learn(64, callback=doctor)
     assert looked_at == [64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_cchain.algorithms.churn_log import log_churn
+from sb3_cchain.algorithms.churn_log import churn_prefix, log_churn
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.recorded import recorded
 from sb3_cchain.algorithms.replay_observations import sample_observations, sample_with_actions
@@ -55,7 +55,7 @@ def reduced_off_policy(model: Any, reducers: Mapping[str, ChurnReducer]) -> Iter
     for name, reducer in reducers.items():
         if reducer.losses:
             loss = abs(targets[name].base_loss(model, logged))
-            prefix = "churn" if len(reducers) == 1 else f"churn/{name}"
+            prefix = churn_prefix(name, reducers)
             log_churn(model.logger.record_mean, prefix, coefs[name], float(np.mean(reducer.losses)), loss)
             churn = reducer.mean_churn() if name == "policy" else np.mean(changes[name])
             model.logger.record_mean(f"churn/{name}_churn", churn)

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_cchain.algorithms.churn_log import log_churn
+from sb3_cchain.algorithms.churn_log import churn_prefix, log_churn
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.last_surrogate import last_surrogate
 from sb3_cchain.algorithms.recorded import recorded
@@ -165,7 +165,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
             reducer.next_reference = references.current
         if reducer.losses:
             loss = _take_losses(model, logged, targets[name], reducer, options, surrogate)
-            prefix = "churn" if len(reducers) == 1 else f"churn/{name}"
+            prefix = churn_prefix(name, reducers)
             log_churn(model.logger.record, prefix, coefs[name], float(np.mean(reducer.losses)), loss)
             if name == "policy":
                 model.logger.record("churn/policy_churn", reducer.mean_churn())
