@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.analysis import NetworkHealth
-from sb3_cchain.analysis.health import network_health, remember_initial_parameters, trained_groups
+from sb3_cchain.analysis.health_figures import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.methods import L2Init, ReDo
 from sb3_cchain.networks import CReLU, CReLUPolicy, FourierFeatures, FourierPolicy

@@ -23,7 +23,7 @@ from sb3_cchain import CChainPPO, TaskSync
 from sb3_cchain.envs import ContinualProcgen, ContinualProcgenVecEnv, ProcgenGame
 from sb3_cchain.envs.procgen import DISTRIBUTION_MODES, GAMES
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 
 # Of the whole module, as there are no wheels for Python 3.13
 procgen = pytest.importorskip("procgen")

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cchain.analysis import ChurnMonitor, Doctor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.findings import CHECKS, Finding, as_json, diagnose
-from sb3_cchain.analysis.health import trained_groups
+from sb3_cchain.analysis.health_figures import trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.ntk import has_ntk
 from sb3_cchain.analysis.plots import plot_models
@@ -29,7 +29,7 @@ from sb3_cchain.callbacks import ContinualMetrics, TaskLearningStarts
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.validation import check_number
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.health import network_health, remember_initial_parameters, trained_groups
+from sb3_cchain.analysis.health_figures import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
@@ -16,7 +16,7 @@ from sb3_cchain.validation import check_number
 class NetworkHealth(TrainingInterval):
     r"""
     Logs, under ``health/``, figures that are known to go along with the loss of plasticity. For formulas and sources see
-    :func:`~sb3_cchain.analysis.health.network_health`, which computes
+    :func:`~sb3_cchain.analysis.health_figures.network_health`, which computes
 
     - ``dormant_share``: share of the hidden units that are τ-dormant
     - ``active_share``: share of the pairs of unit and observation with a positive activation, for ReLU, ReLU6 and CReLU

@@ -14,7 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from sb3_cchain.analysis.health import group_of, hidden_activations, trained_groups
+from sb3_cchain.analysis.health_figures import group_of, hidden_activations, trained_groups
 from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.metrics.rank import singular_values, srank
 from sb3_cchain.analysis.model_outputs import ModelOutputs, model_outputs
@@ -148,7 +148,7 @@ def action_std(model: BaseAlgorithm, batch: Batch) -> th.Tensor | None:
 def network_symptoms(model: BaseAlgorithm, batch: Batch) -> Symptoms:
     r"""
     What is in the networks. The first three are of the units behind the activation functions that
-    :func:`~sb3_cchain.analysis.health.network_health` finds, and are given for each group of layers or each layer.
+    :func:`~sb3_cchain.analysis.health_figures.network_health` finds, and are given for each group of layers or each layer.
 
     - ``dormant_units``: share of the units with a score of at most 0.025 (Sokar et al., ICML 2023,
       https://arxiv.org/abs/2302.12902)

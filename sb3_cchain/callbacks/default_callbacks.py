@@ -7,7 +7,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.callbacks.continual_metrics import ContinualMetrics
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.sync import TaskSync
 from sb3_cchain.tasks.task_signal import TaskSignal
 

@@ -12,7 +12,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_cchain.checkpoint.environment_state import named_layers
 from sb3_cchain.checkpoint.object_state import object_states, restore_objects
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 
 
 def lasting_state(env: VecEnv, left_out: list[str]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 
 
 def find_eval_envs(callback: BaseCallback | None) -> list[VecEnv]:

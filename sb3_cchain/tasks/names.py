@@ -4,7 +4,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cchain.tasks.signal import is_continual
+from sb3_cchain.tasks.continual import is_continual
 
 
 def task_names(env: VecEnv) -> list[str]:

@@ -15,7 +15,6 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 # Where an environment that numbers its tasks does so
@@ -187,26 +186,3 @@ def task_switched(model: BaseAlgorithm) -> None:
 
 def _count_one_more(model: BaseAlgorithm) -> None:
     model.task_count = getattr(model, "task_count", 0) + 1  # type: ignore[attr-defined]
-
-
-def is_continual(env: VecEnv | None) -> bool:
-    """
-    :param env: A vectorised environment
-    :return: Whether it consists of :class:`~sb3_cchain.ContinualEnv`
-    """
-    if env is None or not (env.has_attr("task_sequence") and env.has_attr("set_clock")):
-        return False
-    # Vectorised environments that have no attributes to give may give None for all of them
-    return env.get_attr("task_sequence", indices=0)[0] is not None
-
-
-def require_continual(callback: BaseCallback) -> None:
-    """
-    :param callback: A callback for continual environments, when training starts
-    :raises TypeError: When the training environment is not continual
-    """
-    if not is_continual(callback.training_env):
-        raise TypeError(
-            f"{type(callback).__name__} is for continual environments, but the training environment is not one. "
-            'Make it with gymnasium.make("Continual/...") or sb3_cchain.ContinualEnv.'
-        )
