@@ -16,7 +16,8 @@ import sb3_cchain.zoo.__main__
 import sb3_cchain.zoo.inspect
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, NetworkHealth
-from sb3_cchain.analysis.inspection import inspect_model, report
+from sb3_cchain.analysis.inspection import inspect_model
+from sb3_cchain.analysis.inspection_report import report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint

@@ -7,7 +7,8 @@ import torch as th
 from stable_baselines3 import PPO
 
 from sb3_cchain.analysis import ChurnMonitor, NetworkHealth, NTKCallback
-from sb3_cchain.analysis.inspection import inspect_model, plot
+from sb3_cchain.analysis.inspection import inspect_model
+from sb3_cchain.analysis.inspection_report import plot
 from sb3_cchain.analysis.plots import plot_ntk
 from tests.envs import RandomEnv
 

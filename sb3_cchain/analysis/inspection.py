@@ -1,13 +1,11 @@
-"""Churn, the neural tangent kernel and the health of the networks of a model, and what is wrong with it, after the fact."""
+"""Looks at a model after its training: churn, the neural tangent kernel, the health of its networks, and what is wrong."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
-from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.logger import Logger
@@ -19,9 +17,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_cchain.analysis import ChurnMonitor, Doctor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.findings import CHECKS, Finding, as_json, diagnose
 from sb3_cchain.analysis.health_figures import trained_groups
-from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.ntk import has_ntk
-from sb3_cchain.analysis.plots import plot_models
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
 from sb3_cchain.analysis.task_evaluation import TaskEvaluation
@@ -31,19 +27,6 @@ from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.validation import check_number
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Drawn for each group of layers, by their names after "health/"
-GROUP_FIGURES = (
-    "dormant_share",
-    "active_share",
-    "feature_srank",
-    "feature_effective_rank",
-    "weight_norm",
-    "distance_from_init",
-)
 
 _MONITORS = (ChurnMonitor, Doctor, NetworkHealth, NTKCallback)
 # Training does not depend on them, and they would write to the files of the training
@@ -69,7 +52,7 @@ class Inspection:
     """
 
     name: str
-    figures: dict[str, float]
+    figures: dict[str, float] = field(default_factory=dict)
     ntk: th.Tensor | None = None
     parameters: dict[str, dict[str, th.Tensor]] = field(default_factory=dict)
     algorithm: str = ""
@@ -122,13 +105,23 @@ def inspect_model(
     check_number("n_steps", n_steps, 1, integer=True)
     check_number("n_updates", n_updates, 1, integer=True)
     _check_env(model)
-    about: dict[str, Any] = {"algorithm": type(model).__name__, "num_timesteps": model.num_timesteps}
+    inspection = Inspection(name, algorithm=type(model).__name__, num_timesteps=model.num_timesteps)
     if not is_finite(model):
-        symptoms = weight_symptoms(model)
-        return Inspection(name, {}, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
-    if not isinstance(model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
-        symptoms, figures = _roll_out(model, n_steps)
-        return Inspection(name, figures, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
+        inspection.symptoms = weight_symptoms(model)
+        inspection.findings = diagnose(inspection.symptoms, model)
+    elif isinstance(model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+        n_steps = _prepare_one_iteration(model, n_steps, n_updates)
+        _look_while_training(inspection, model, n_steps, callbacks)
+    else:
+        inspection.symptoms, inspection.figures = _roll_out(model, n_steps)
+        inspection.findings = diagnose(inspection.symptoms, model)
+    return inspection
+
+
+def _prepare_one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, n_updates: int) -> int:
+    """
+    :return: Environment steps of the iteration
+    """
     model.set_logger(Logger(folder=None, output_formats=[]))
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
@@ -138,40 +131,51 @@ def inspect_model(
         model.gradient_steps = n_updates
     # All episodes of this rollout, and no others
     model.ep_info_buffer, model._stats_window_size = None, n_steps
-    parameters = {
+    return n_steps
+
+
+def _look_while_training(
+    inspection: Inspection, model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, callbacks: Sequence[BaseCallback]
+) -> None:
+    inspection.parameters = {
         group: {name: parameter.detach().clone() for name, parameter in group_parameters.items()}
         for group, group_parameters in trained_groups(model).items()
     }
     knows_its_start = hasattr(model, "initial_parameters")
     health, doctor = NetworkHealth(interval=1), Doctor(interval=1, patience=_NEVER)
-    monitors: list[BaseCallback] = [ChurnMonitor(interval=1), health, doctor]
     ntk = NTKCallback(interval=1, picture_interval=0) if has_ntk(model) else None
-    if ntk is not None:
-        monitors.append(ntk)
-    # The monitors that it was trained with are replaced by those above. TaskLearningStarts would put off the updates
-    others = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS, TaskLearningStarts))]
-    if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in others):
-        others.insert(0, TaskSync())
+    monitors = [ChurnMonitor(interval=1), health, doctor, *([] if ntk is None else [ntk])]
     try:
         # Schedules keep their present values instead of going to their ends
         with replaced(model, "_update_current_progress_remaining", lambda *_: None):
-            model.learn(n_steps, callback=[*others, *monitors], log_interval=_NEVER, reset_num_timesteps=False)
+            callback = [*_kept_callbacks(model, callbacks), *monitors]
+            model.learn(n_steps, callback=callback, log_interval=_NEVER, reset_num_timesteps=False)
     except ValueError:
         if is_finite(model):
             raise
         # An update has made parameters infinite, and PyTorch's distributions do not take them
-        symptoms = {**doctor.symptoms, **weight_symptoms(model)}
-        return Inspection(name, {}, **about, symptoms=symptoms, findings=diagnose(symptoms, model))
-    figures = {
+        inspection.parameters = {}
+        inspection.symptoms = {**doctor.symptoms, **weight_symptoms(model)}
+        inspection.findings = diagnose(inspection.symptoms, model)
+        return
+    inspection.figures = {
         tag: float(value)
         for tag, value in model.logger.name_to_value.items()
         if tag.startswith(("ntk/", "health/", "churn_monitor/"))
         and (knows_its_start or not tag.startswith("health/distance_from_init"))
     }
-    figures.update({f"health/{name}": norm for name, norm in health.gradient_norms().items()})
-    figures.update(_rollout_figures(model.ep_info_buffer or [], n_steps))
-    matrix = getattr(ntk, "matrix", None)  # none, too, where a callback has ended the training before
-    return Inspection(name, figures, matrix, parameters, **about, symptoms=doctor.symptoms, findings=doctor.findings)
+    inspection.figures.update({f"health/{name}": norm for name, norm in health.gradient_norms().items()})
+    inspection.figures.update(_rollout_figures(model.ep_info_buffer or [], n_steps))
+    inspection.ntk = getattr(ntk, "matrix", None)  # none, too, where a callback has ended the training before
+    inspection.symptoms, inspection.findings = doctor.symptoms, doctor.findings
+
+
+def _kept_callbacks(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> list[BaseCallback]:
+    """Without the monitors that it was trained with, and without TaskLearningStarts, which would put off the updates."""
+    kept = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS, TaskLearningStarts))]
+    if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in kept):
+        kept.insert(0, TaskSync())
+    return kept
 
 
 def _rollout_figures(episodes: Iterable[dict[str, float]], n_steps: int) -> dict[str, float]:
@@ -204,116 +208,3 @@ def _check_env(model: BaseAlgorithm) -> None:
         raise ValueError(
             f"The model has no environment: load it with one, {name}.load(path, env), or give it one by set_env(env)"
         )
-
-
-def report(inspections: Sequence[Inspection]) -> list[Table]:
-    """
-    :param inspections: Of one model, or of two to compare
-    :return: Tables
-    """
-    tables = []
-    for title, prefix in (
-        ("Rollout", "rollout/"),
-        ("Churn of an update, on the rollout's data", "churn_monitor/fresh/"),
-        ("Neural tangent kernel", "ntk/"),
-        ("Networks", "health/"),
-    ):
-        tags = [tag for tag in _tags(inspections, prefix) if "/" not in tag.removeprefix(prefix)]
-        tables.append(_table(title, inspections, {_words(tag.removeprefix(prefix)): tag for tag in tags}))
-    tags = sorted((tag for tag in _tags(inspections, "health/") if tag.count("/") > 1), key=_group)
-    rows = {f"{_group(tag)}: {_words(tag.split('/')[1])}": tag for tag in tags}
-    tables.append(_table("Groups of layers", inspections, rows))
-    if len(inspections) == 2:
-        tables.append(_distances(*inspections))
-    return [table for table in tables if table.row_count]
-
-
-def findings_text(inspection: Inspection) -> str:
-    """
-    :param inspection: Of a model
-    :return: Its findings, with the code of what to try
-    """
-    lines = [f"{inspection.name}: {len(inspection.findings) or 'no'} finding{'' if len(inspection.findings) == 1 else 's'}"]
-    for finding in inspection.findings:
-        lines += ["", f"{finding.check.title} ({finding.check.certainty}: {finding.check.name})", f"  {finding.measured()}"]
-        for remedy in finding.remedies:
-            lines += [f"  Try {remedy.title}:", *(f"      {line}" for line in remedy.line.splitlines())]
-    return "\n".join(lines)
-
-
-def _distances(a: Inspection, b: Inspection) -> Table:
-    table = Table("", "L2 distance", title=f"From {a.name}'s parameters to {b.name}'s", title_justify="left", min_width=60)
-    shapes_of_a, shapes_of_b = (
-        {group: [(name, p.shape) for name, p in parameters.items()] for group, parameters in inspection.parameters.items()}
-        for inspection in (a, b)
-    )
-    differences = {
-        group: [b.parameters[group][name] - parameter for name, parameter in parameters.items()]
-        for group, parameters in a.parameters.items()
-        if shapes_of_a[group] == shapes_of_b.get(group)
-    }
-    for name, distance in group_norms("together", differences).items():
-        table.add_row(name.removeprefix("together/"), f"{distance:.4g}" if differences else "")
-    for group in dict.fromkeys([*shapes_of_a, *shapes_of_b]):
-        if group not in differences:
-            table.add_row(group, "not of the same shape")
-    return table
-
-
-def _words(name: str) -> str:
-    return "gradient norm, clipped" if name == "gradient_norm" else name.replace("_", " ")
-
-
-def _group(tag: str) -> str:
-    return tag.split("/", 2)[2]
-
-
-def _tags(inspections: Sequence[Inspection], prefix: str) -> list[str]:
-    return [tag for tag in dict.fromkeys(t for i in inspections for t in i.figures) if tag.startswith(prefix)]
-
-
-def _table(title: str, inspections: Sequence[Inspection], rows: dict[str, str]) -> Table:
-    table = Table("", title=title, title_justify="left", min_width=60)
-    for inspection in inspections:
-        table.add_column(inspection.name, justify="right")
-    if len(inspections) == 2:
-        table.add_column("ratio", justify="right")
-    for name, tag in rows.items():
-        values = [inspection.figures.get(tag, np.nan) for inspection in inspections]
-        ratio = [f"{values[1] / values[0]:.3g}" if values[0] else ""] if len(values) == 2 else []
-        table.add_row(name, *(f"{value:.4g}" for value in values), *ratio)
-    return table
-
-
-def draw(inspections: Sequence[Inspection]) -> "Figure":
-    """
-    Draw the NTKs, and the figures of each group of layers.
-
-    :param inspections: Of one model, or of two to compare
-    :return: The picture
-    :raises ImportError: Without matplotlib
-    """
-    tags = [tag for tag in _tags(inspections, "health/") if tag.count("/") > 1]
-    groups = list(dict.fromkeys(map(_group, tags)))
-    bars = {
-        name.replace("_", " ").replace("feature ", "feature\n"): [
-            [inspection.figures.get(f"health/{name}/{group}", np.nan) for group in groups] for inspection in inspections
-        ]
-        for name in GROUP_FIGURES
-        if any(tag.startswith(f"health/{name}/") for tag in tags)
-    }
-    ntks = [(i.ntk, f"{i.name}: NTK, srank {i.figures['ntk/srank']:.0f}") for i in inspections if i.ntk is not None]
-    return plot_models([inspection.name for inspection in inspections], ntks, groups, bars)
-
-
-def plot(inspections: Sequence[Inspection], path: Path) -> None:
-    """
-    Save the picture of :func:`draw`.
-
-    :param inspections: Of one model, or of two to compare
-    :param path: PNG file
-    :raises ImportError: Without matplotlib
-    """
-    figure = draw(inspections)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)

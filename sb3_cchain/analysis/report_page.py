@@ -7,7 +7,8 @@ from html import escape
 from string import Template
 
 from sb3_cchain.analysis.findings import CHECKS, Check, Finding, number
-from sb3_cchain.analysis.inspection import Inspection, draw
+from sb3_cchain.analysis.inspection import Inspection
+from sb3_cchain.analysis.inspection_report import draw
 
 # Colours as the reader has set them, dark or light; pictures keep their white background
 _PAGE = Template("""<!DOCTYPE html>

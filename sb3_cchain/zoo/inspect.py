@@ -26,7 +26,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.analysis.findings import BY_NAME, CERTAINTIES
-from sb3_cchain.analysis.inspection import Inspection, findings_text, inspect_model, plot, report
+from sb3_cchain.analysis.inspection import Inspection, inspect_model
+from sb3_cchain.analysis.inspection_report import findings_text, plot, report
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.checkpoint import check_model_file, check_writable
