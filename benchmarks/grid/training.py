@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -218,23 +218,16 @@ def metrics_rows(chain: Sequence[Attempt], further: Sequence[str] = ()) -> list[
     :return: Rows of ``metrics.csv``: what they logged to TensorBoard, to six digits. What an attempt logged after the
         checkpoint that the next one goes on from is left out, because it comes again
     """
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     beginnings = (*METRIC_PREFIXES, *further)
     # By name, and by environment steps
     values: dict[str, dict[int, list[str]]] = {}
     for attempt, following in zip(chain, [*chain[1:], None], strict=True):
         last = math.inf if following is None or following.origin is None else following.origin.num_timesteps
-        logged_here: dict[str, dict[int, list[str]]] = {}
-        for folder in sorted({file.parent for file in attempt.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
-            logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
-            logged.Reload()
-            for name in logged.Tags()["scalars"]:
-                if name.startswith(beginnings):
-                    for event in logged.Scalars(name):
-                        if event.step <= last:
-                            logged_here.setdefault(name, {}).setdefault(event.step, []).append(f"{event.value:.6g}")
-        for name, by_step in logged_here.items():
+        logged: dict[str, dict[int, list[str]]] = {}
+        for name, step, value in _logged_scalars(attempt):
+            if name.startswith(beginnings) and step <= last:
+                logged.setdefault(name, {}).setdefault(step, []).append(f"{value:.6g}")
+        for name, by_step in logged.items():
             values.setdefault(name, {}).update(by_step)
     return [
         {"timesteps": step, "name": name, "value": value}
@@ -242,6 +235,17 @@ def metrics_rows(chain: Sequence[Attempt], further: Sequence[str] = ()) -> list[
         for step, logged_values in by_step.items()
         for value in logged_values
     ]
+
+
+def _logged_scalars(attempt: Attempt) -> Iterator[tuple[str, int, float]]:
+    """Name, environment steps and value of all that an attempt logged to TensorBoard."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    for folder in sorted({file.parent for file in attempt.folder.glob("tensorboard/*/*/events.out.tfevents.*")}):
+        logged = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
+        logged.Reload()
+        for name in logged.Tags()["scalars"]:
+            yield from ((name, event.step, event.value) for event in logged.Scalars(name))
 
 
 def _joined(texts: Iterable[str | None]) -> str | None:

@@ -1,6 +1,6 @@
 """Which weights lead into and out of each hidden unit of a network."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeGuard
@@ -65,23 +65,7 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
         (1 + unit * 2.0**-22).to(layer.weight).requires_grad_()
         for layer, unit in zip(layers, th.arange(1, sum(sizes) + 1).split(sizes), strict=True)
     ]
-    tag_of: dict[nn.Module, th.Tensor] = dict(zip(layers, tags, strict=True))
-    arrived: dict[nn.Module, th.Tensor] = {}
-
-    def send_tags(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> th.Tensor | None:
-        if module in tag_of:
-            arrived[module] = _channels_last(module, inputs[0])
-            tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
-            return tagged.clone()  # for activations that write into their inputs
-        if isinstance(module, (CReLU, FourierFeatures)):
-            return th.cat([inputs[0], inputs[0]], dim=1)
-        if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
-            arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
-        return inputs[0] if isinstance(module, (*ELEMENTWISE_ACTIVATIONS, nn.Dropout, nn.LayerNorm)) else None
-
-    with forward_hooks(names, send_tags), th.enable_grad():
-        run()
-
+    arrived = _send_tags(names, dict(zip(layers, tags, strict=True)), run)
     all_tags = th.cat(tags).detach()
     sources = {module: _read(all_tags, tagged) for module, tagged in arrived.items()}
     elsewhere = th.zeros(len(all_tags), dtype=th.bool, device=all_tags.device)
@@ -102,6 +86,33 @@ def find_hidden_units(network: nn.Module, run: Callable[[], Any]) -> list[Hidden
             found.append(HiddenUnits(names[layer], size, outgoing, norms))
         first += size
     return found
+
+
+def _send_tags(
+    modules: Iterable[nn.Module], tag_of: Mapping[nn.Module, th.Tensor], run: Callable[[], Any]
+) -> dict[nn.Module, th.Tensor]:
+    """
+    :param modules: All modules of a network
+    :param tag_of: For each of its layers the tags of the units, which it gives out instead of its outputs
+    :param run: Calls the network
+    :return: What arrives at each layer, ``(batch and positions, channels)``, and at each LayerNorm that has parameters
+    """
+    arrived: dict[nn.Module, th.Tensor] = {}
+
+    def send_tags(module: nn.Module, inputs: tuple[th.Tensor, ...], output: th.Tensor) -> th.Tensor | None:
+        if module in tag_of:
+            arrived[module] = _channels_last(module, inputs[0])
+            tagged = tag_of[module].expand(*output.movedim(_channel_dim(module), -1).shape).movedim(-1, _channel_dim(module))
+            return tagged.clone()  # for activations that write into their inputs
+        if isinstance(module, (CReLU, FourierFeatures)):
+            return th.cat([inputs[0], inputs[0]], dim=1)
+        if isinstance(module, nn.LayerNorm) and module.elementwise_affine:
+            arrived[module] = inputs[0].reshape(-1, *module.normalized_shape)[0].flatten()[None]
+        return inputs[0] if isinstance(module, (*ELEMENTWISE_ACTIVATIONS, nn.Dropout, nn.LayerNorm)) else None
+
+    with forward_hooks(modules, send_tags), th.enable_grad():
+        run()
+    return arrived
 
 
 def find_flattened_units(network: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
