@@ -147,7 +147,7 @@ _OF_VALUES: dict[Divergence, float] = {mean_squared_difference: 0.01}
 # Where 0.01 made learning slower, or in some seeds worse, or stopped it after a switch (docs/modules/family.md)
 _OF_SENSITIVE_VALUES: dict[Divergence, float] = {mean_squared_difference: 1e-3}
 # A2C's policy loss, of advantages that are not normalised, is about a hundred times PPO's clipped surrogate, which is near 0.
-# With PPO's β it learns nothing (docs/modules/family.md)
+# With PPO's β it learns next to nothing (docs/modules/family.md)
 _OF_A2C: dict[Divergence, float] = {cross_entropy: 10.0, mean_squared_difference: 5e-5}
 # Released code of Tang and Berseth (NeurIPS 2024) for TD3
 _OF_ACTIONS: dict[Divergence, float] = {mean_squared_difference: 5e-5}

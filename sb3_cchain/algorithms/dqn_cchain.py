@@ -32,8 +32,8 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     Deviation from the code released with the paper: the reference batch is drawn, and the old outputs are computed, before
     the update instead of by a copy of the network after it.
 
-    The defaults do not depend on the scale of rewards: λ adapts from the first updates on. The paper's values for MinAtar,
-    ``"auto_50"``, a warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other tasks a λ
+    The defaults do not depend on the scale of rewards: λ adapts from the first updates on. The values of the released code for
+    MinAtar, ``"auto_50"``, a warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other tasks a λ
     of 50 can be so strong that nothing is learned.
 
     :param args: Arguments of DoubleDQN

@@ -1,4 +1,4 @@
-"""Evaluates on the task being trained, as the paper does in DeepMind Control and MinAtar."""
+"""Evaluates on the task being trained, as the released code does in DeepMind Control and MinAtar."""
 
 from sb3_cchain.analysis.task_evaluation import TaskEvaluation
 from sb3_cchain.callbacks.returns_file import COLUMNS
