@@ -12,7 +12,7 @@ from sb3_cchain import CChainCallback, CChainPPO, ContinualMetrics, TaskSync
 from sb3_cchain.callbacks import TaskLearningStarts
 from sb3_cchain.methods import Oracle
 from sb3_cchain.tasks.clock import TaskClock
-from sb3_cchain.tasks.switch import TaskSwitch
+from sb3_cchain.tasks.signal import TaskSwitch
 from tests.envs import CountEnv
 from tests.method_models import ALGORITHMS, make_env, make_model
 

@@ -212,12 +212,52 @@ def test_another_device_is_refused(checkpoints, tmp_path):
         (["--resume", "{}", "-optimize"], "--resume does not go with -optimize"),
         (["--resume", "{}", "-i", "model.zip"], r"--resume and -i are both given, .* and model.zip: --resume goes on exactly"),
         (["--resume", "nowhere"], "--resume: nowhere is not a checkpoint"),
+        (["--resume", "last"], "--resume last begins a training where .*: give --checkpoint-freq STEPS, too"),
     ],
 )
 def test_options_that_cannot_be_are_refused_before_any_work(checkpoints, tmp_path, options, message):
     with pytest.raises(SystemExit, match=message):
         train(tmp_path, *[option.format(checkpoints) for option in options])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_command_begins_and_goes_on_until_the_training_is_finished(tmp_path, at_step, capsys):
+    """As a job that a cluster kills and starts again."""
+    train(tmp_path)
+    job = ("--checkpoint-freq", 32, "--resume", "last")
+    for step in (20, 80, 90, 120):
+        at_step(step, kill)
+        with pytest.raises(Killed):
+            train(tmp_path, *job)
+    at_step(0, kill)
+    train(tmp_path, *job)
+    assert_same_end(tmp_path, 1, 6)
+    origins = [run_folder(tmp_path, number) / "resumed_from" for number in range(2, 7)]
+    # Killed before its first checkpoint, the first job begins again; the third one made none of its own
+    assert [origin.exists() for origin in origins] == [False, False, True, True, True]
+    steps = [int(origin.read_text().rpartition("_")[2]) for origin in origins[2:]]
+    assert steps == [64, 64, 96]
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as finished:
+        train(tmp_path, *job)
+    assert finished.value.code == 0 and "is finished: it made 192 of 192 steps" in capsys.readouterr().out
+
+
+def test_the_last_run_is_that_of_the_environment_and_the_algorithm(checkpoints, tmp_path):
+    parent = tmp_path / "logs" / "ppo_cchain"
+    for name in (f"{NAME}_9", f"{NAME}_10", f"{NAME}-slippery_11"):
+        shutil.copytree(checkpoints, parent / name)
+    (parent / f"{NAME}_12").mkdir()
+    train(tmp_path, "--checkpoint-freq", 32, "--resume", "last", n=160, evaluation=NO_EVALUATION)
+    assert (run_folder(tmp_path, 13) / "resumed_from").read_text().startswith(f"{parent / NAME}_10/")
+
+
+def test_a_run_that_ended_before_its_first_checkpoint(tmp_path, at_step):
+    at_step(20, kill)
+    with pytest.raises(Killed):
+        train(tmp_path, "--checkpoint-freq", 32)
+    with pytest.raises(SystemExit, match=f"{run_folder(tmp_path, 1)} ended before its first checkpoint: start it again"):
+        train(tmp_path, "--resume", run_folder(tmp_path, 1))
 
 
 def test_checkpoints_that_the_command_did_not_make(checkpoints, tmp_path):

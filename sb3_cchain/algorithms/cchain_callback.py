@@ -17,7 +17,7 @@ from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.tasks.callback_tree import require_single
-from sb3_cchain.tasks.switch import TaskSwitch, step_task
+from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
 

@@ -15,7 +15,7 @@ from sb3_cchain.algorithms.reduced_churn import reduced_churn
 from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
-from sb3_cchain.tasks.switch import TaskSwitch, step_task
+from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
 

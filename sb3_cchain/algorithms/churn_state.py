@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
-from sb3_cchain.tasks.switch import TaskSwitch
+from sb3_cchain.tasks.signal import TaskSwitch
 
 
 class ChurnState:

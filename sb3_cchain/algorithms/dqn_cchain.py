@@ -33,8 +33,8 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
     the update instead of by a copy of the network after it.
 
     The defaults do not depend on the scale of rewards: λ adapts from the first updates on. The values of the released code for
-    MinAtar, ``"auto_50"``, a warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other tasks a λ
-    of 50 can be so strong that nothing is learned.
+    MinAtar, ``"auto_50"``, a warm-up of 10 000 and a window of 50 000 updates, are in the YAML file of the package. On other
+    tasks a λ of 50 can be so strong that nothing is learned.
 
     :param args: Arguments of DoubleDQN
     :param churn_target: What is held still: ``"value"``, and ``"auto"`` is the same, because DQN has no policy of its own

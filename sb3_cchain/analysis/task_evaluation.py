@@ -24,7 +24,7 @@ from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_same_tasks
-from sb3_cchain.tasks.switch import TASK_KEY, TaskSwitch, active_signal, first_reset_info
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number

@@ -15,7 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.switch import (
+from sb3_cchain.tasks.signal import (
     TASK_KEY,
     TaskSwitch,
     episode_goes_on,

@@ -7,7 +7,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cchain.tasks.callback_tree import will_be_restored
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.switch import TaskSwitch, episode_task, step_task
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
 from sb3_cchain.validation import check_number
 
 

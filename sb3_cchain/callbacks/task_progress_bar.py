@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cchain.callbacks.learn_call import LearnCall
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
-from sb3_cchain.tasks.switch import TaskSwitch, active_signal, told_task
+from sb3_cchain.tasks.signal import TaskSwitch, active_signal, told_task
 
 SECONDS_BETWEEN_DRAWINGS = 0.25
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from sb3_cchain.envs.reset import reset_env
-from sb3_cchain.tasks.switch import TASK_KEY
+from sb3_cchain.tasks.signal import TASK_KEY
 
 # Of the height of a frame. Smaller letters than of 10 pixels cannot be read
 _LETTERS, _LEAST_LETTERS = 1 / 16, 10

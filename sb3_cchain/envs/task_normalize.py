@@ -9,7 +9,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
-from sb3_cchain.tasks.switch import TASK_KEY, TaskSwitch, active_signal, first_reset_info
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.validation import check_bool
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]

@@ -5,7 +5,7 @@ from abc import abstractmethod
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.switch import TaskSwitch, episode_task
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task
 
 
 class TaskBoundary(BaseCallback):

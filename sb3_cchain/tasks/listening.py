@@ -6,7 +6,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_single, will_be_restored
 from sb3_cchain.tasks.continual import require_continual
-from sb3_cchain.tasks.switch import active_signal, episode_task
+from sb3_cchain.tasks.signal import active_signal, episode_task
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tasks.task_signal import TaskSignal
 

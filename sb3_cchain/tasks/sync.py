@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_apart, check_same_tasks, evaluate_on, find_eval_envs
-from sb3_cchain.tasks.switch import TASK_KEY, TaskSwitch, first_reset_info
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info
 
 
 class TaskSync(BaseCallback):

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.drift import Drift
-from sb3_cchain.tasks.switch import (
+from sb3_cchain.tasks.signal import (
     TASK_KEY,
     episode_goes_on,
     first_reset_info,

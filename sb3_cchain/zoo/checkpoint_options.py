@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,9 @@ COMMAND = "command.json"
 
 # Checkpoints that stay
 KEEP = 2
+
+# In the place of a path after --resume
+LAST = Path("last")
 
 # Options of RL Zoo that training depends on, and evaluations, which draw random numbers
 COMPARED = (
@@ -92,7 +96,8 @@ def make_parser() -> argparse.ArgumentParser:
         "--resume",
         type=Path,
         metavar="PATH",
-        help="Go on exactly from a checkpoint, from the newest in a folder of checkpoints, or from that of a run folder. All "
+        help="Go on exactly from a checkpoint, from the newest in a folder of checkpoints, or from that of a run folder. "
+        "`last` is the last run of --algo and --env in the log folder; where none has a checkpoint, training begins. All "
         "other options must be those of that training, but a greater --n-timesteps trains longer",
     )
     return parser
@@ -119,6 +124,8 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
     if given.checkpoint_freq is None and given.resume is None:
         option = "--checkpoint-keep" if given.checkpoint_keep is not None else "--checkpoint-inexact"
         sys.exit(f"{option} is about checkpoints: give --checkpoint-freq STEPS, too")
+    if given.checkpoint_freq is None and given.resume == LAST:
+        sys.exit("--resume last begins a training where there is none to go on from: give --checkpoint-freq STEPS, too")
     if other.optimize_hyperparameters:
         sys.exit(f"{'--checkpoint-freq' if given.resume is None else '--resume'} does not go with -optimize")
     if given.resume is not None and other.trained_agent:
@@ -135,12 +142,17 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     :param options: The options
     :param arguments: Arguments for RL Zoo
     :return: With ``--resume``, the options with the checkpoint, and the arguments with its seed where none is given
-    :raises SystemExit: When there is no whole checkpoint
+    :raises SystemExit: When there is no whole checkpoint, unless ``last`` is asked for
     """
+    if options.resume == LAST:
+        options = options._replace(resume=find_last_run(arguments))
     if options.resume is None:
-        return options, arguments
+        return options._replace(keep=options.keep or KEEP), arguments
     try:
-        checkpoint = find_checkpoint(_where_to_look(options.resume))
+        folder = _where_to_look(options.resume)
+        if (folder / COMMAND).is_file() and not any(folder.glob("step_*")):
+            raise ValueError(f"{options.resume} ended before its first checkpoint: start it again without --resume")
+        checkpoint = find_checkpoint(folder)
         record = read_record(checkpoint.folder)
     except (ValueError, OSError) as error:
         sys.exit(f"--resume: {error}")
@@ -154,12 +166,35 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     return options._replace(freq=freq, keep=keep, exact=exact, checkpoint=checkpoint, record=record), arguments
 
 
+def find_last_run(arguments: Sequence[str]) -> Path | None:
+    """
+    :param arguments: Arguments for RL Zoo
+    :return: The last run folder of its algorithm and environment with a checkpoint to go on from; None where there is none
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo", default="ppo")
+    parser.add_argument("--env", default="CartPole-v1")
+    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
+    given, _ = parser.parse_known_args(arguments)
+    runs = re.compile(re.escape(given.env.replace("/", "-")) + r"_(\d+)(_[-0-9a-f]{36})?")  # the latter by --uuid
+    numbers = {
+        folder: int(match[1])
+        for folder in (given.log_folder / given.algo).glob("*")
+        if (match := runs.fullmatch(folder.name)) and (_has_checkpoint(folder) or (folder / RESUMED_FROM).is_file())
+    }
+    return max(numbers, key=numbers.__getitem__, default=None)
+
+
 def _where_to_look(resume: Path) -> Path:
     """For a run folder its checkpoints, or those that the run itself went on from, if it was killed before it saved one."""
     inside, resumed_from = resume / CHECKPOINTS, resume / RESUMED_FROM
-    if not any(inside.glob("step_*")) and resumed_from.is_file():
+    if not _has_checkpoint(resume) and resumed_from.is_file():
         return Path(resumed_from.read_text().strip())
     return inside if inside.is_dir() else resume
+
+
+def _has_checkpoint(run: Path) -> bool:
+    return any((run / CHECKPOINTS).glob("step_*"))
 
 
 def write_record(

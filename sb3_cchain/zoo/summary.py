@@ -21,7 +21,7 @@ from sb3_cchain.callbacks.task_progress_bar import as_clock
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
-from sb3_cchain.tasks.switch import active_signal
+from sb3_cchain.tasks.signal import active_signal
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
 
 # Episodes that the return at the end of a task is the mean of, at least
