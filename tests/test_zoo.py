@@ -403,3 +403,28 @@ def test_what_is_no_command(monkeypatch, arguments, message):
     monkeypatch.setattr(sys, "argv", ["sb3-cchain", *arguments])
     with pytest.raises(SystemExit, match=message):
         console.main()
+
+
+def test_modules_of_the_present_folder_are_found(tmp_path, monkeypatch):
+    """By the console script, too, which Python starts without the present folder on its path."""
+    (tmp_path / "module_of_a_user.py").write_text(
+        "import gymnasium as gym\n\n"
+        "gym.register('OfAUser-v0', 'gymnasium.envs.classic_control:CartPoleEnv', max_episode_steps=9)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    (tmp_path / "own.yml").write_text("OfAUser-v0:\n  policy: MlpPolicy\n  n_timesteps: 32\n")
+    arguments = (
+        "--algo",
+        "ppo",
+        "--env",
+        "OfAUser-v0",
+        "-conf",
+        "own.yml",
+        "--gym-packages",
+        "module_of_a_user",
+        "-f",
+        "logs",
+    )
+    command("train", *arguments, *FAST, *NO_EVALUATION, *SHORT_PPO)
+    assert (tmp_path / "logs" / "ppo" / "OfAUser-v0_1" / "OfAUser-v0.zip").is_file()

@@ -1,6 +1,7 @@
 """The methods that C-CHAIN is compared with, as parts for any Stable-Baselines3 algorithm; the table of all methods."""
 
 from sb3_cchain.methods.adam_rel import AdamRel
+from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.methods.continual_backprop import ContinualBackprop
 from sb3_cchain.methods.ewc import EWC
 from sb3_cchain.methods.ewc_consolidation import EWCConsolidation
@@ -54,4 +55,5 @@ __all__ = [
     "ShrinkAndPerturb",
     "SpectralRegularization",
     "WeightClipping",
+    "forget_references",
 ]

@@ -21,6 +21,10 @@ class TaskBoundary(BaseCallback):
     ``train_freq - 1`` (DQN) steps per environment late; a network that changed in the middle of a rollout would be trained on
     advantages and probabilities that another network computed.
 
+    A subclass has the method ``_on_task_switch()``, which is called then. If it also has ``_on_training_start()`` or
+    ``_on_rollout_start()``, these must call ``super()``'s, which listen to the switches. One that changes the network calls
+    :func:`~sb3_cchain.methods.forget_references`.
+
     The task is kept with the model, as ``model.trained_task_id``, so that training that is saved at a switch and resumed
     has it too.
     """

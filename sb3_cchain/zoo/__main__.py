@@ -1,5 +1,6 @@
 """The console script ``sb3-cchain``, also ``python -m sb3_cchain.zoo``."""
 
+import os
 import sys
 
 from sb3_cchain import __version__
@@ -44,6 +45,8 @@ def main() -> None:
             from sb3_cchain.zoo import cli
         except ImportError as error:
             sys.exit(f"sb3-cchain: {error}")
+        # As with `python -m`: modules of --gym-packages may lie in the present folder
+        sys.path.append(os.getcwd())
         cli.run(command)
 
 
