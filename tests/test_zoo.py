@@ -414,17 +414,6 @@ def test_modules_of_the_present_folder_are_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     (tmp_path / "own.yml").write_text("OfAUser-v0:\n  policy: MlpPolicy\n  n_timesteps: 32\n")
-    arguments = (
-        "--algo",
-        "ppo",
-        "--env",
-        "OfAUser-v0",
-        "-conf",
-        "own.yml",
-        "--gym-packages",
-        "module_of_a_user",
-        "-f",
-        "logs",
-    )
-    command("train", *arguments, *FAST, *NO_EVALUATION, *SHORT_PPO)
+    own = ("-conf", "own.yml", "--gym-packages", "module_of_a_user")
+    command("train", "--algo", "ppo", "--env", "OfAUser-v0", *own, "-f", "logs", *FAST, *NO_EVALUATION, *SHORT_PPO)
     assert (tmp_path / "logs" / "ppo" / "OfAUser-v0_1" / "OfAUser-v0.zip").is_file()

@@ -277,9 +277,15 @@ def test_a_torn_checkpoint_is_passed_over(checkpoints, tmp_path):
     assert saved_timesteps(run_folder(tmp_path, 1) / f"{NAME}.zip") == 96
 
 
-def test_a_resumed_run_without_a_checkpoint_of_its_own(checkpoints, tmp_path):
-    """It was killed before it saved one, so training goes on from where it went on from."""
+def test_a_resumed_run_without_a_checkpoint_of_its_own(checkpoints, tmp_path, capsys):
+    """It is finished, or was killed before it saved one. Then training goes on from where it went on from."""
     train(tmp_path, "--resume", checkpoints, "--checkpoint-freq", 10**6, n=128, evaluation=NO_EVALUATION)
+    for resume in ("last", run_folder(tmp_path, 1)):
+        with pytest.raises(SystemExit) as finished:
+            train(tmp_path, "--resume", resume, "--checkpoint-freq", 10**6, n=128, evaluation=NO_EVALUATION)
+        assert finished.value.code == 0
+        told = capsys.readouterr().out
+        assert f"The training in {run_folder(tmp_path, 1)} is finished: it made 128 of 128 steps." in told
     os.remove(run_folder(tmp_path, 1) / f"{NAME}.zip")
     train(tmp_path, "--resume", run_folder(tmp_path, 1), n=128, evaluation=NO_EVALUATION)
     assert (run_folder(tmp_path, 2) / "resumed_from").read_text().startswith(str(checkpoints))

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from sb3_cchain.checkpoint import write_safely
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint
 
 # In a run folder
 CHECKPOINTS = "checkpoints"
@@ -150,7 +150,7 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
         return options._replace(keep=options.keep or KEEP), arguments
     try:
         folder = _where_to_look(options.resume)
-        if (folder / COMMAND).is_file() and not any(folder.glob("step_*")):
+        if (folder / COMMAND).is_file() and not has_checkpoint(folder):
             raise ValueError(f"{options.resume} ended before its first checkpoint: start it again without --resume")
         checkpoint = find_checkpoint(folder)
         record = read_record(checkpoint.folder)
@@ -180,7 +180,8 @@ def find_last_run(arguments: Sequence[str]) -> Path | None:
     numbers = {
         folder: int(match[1])
         for folder in (given.log_folder / given.algo).glob("*")
-        if (match := runs.fullmatch(folder.name)) and (_has_checkpoint(folder) or (folder / RESUMED_FROM).is_file())
+        if (match := runs.fullmatch(folder.name))
+        and (has_checkpoint(folder / CHECKPOINTS) or (folder / RESUMED_FROM).is_file())
     }
     return max(numbers, key=numbers.__getitem__, default=None)
 
@@ -188,13 +189,9 @@ def find_last_run(arguments: Sequence[str]) -> Path | None:
 def _where_to_look(resume: Path) -> Path:
     """For a run folder its checkpoints, or those that the run itself went on from, if it was killed before it saved one."""
     inside, resumed_from = resume / CHECKPOINTS, resume / RESUMED_FROM
-    if not _has_checkpoint(resume) and resumed_from.is_file():
+    if not has_checkpoint(inside) and resumed_from.is_file():
         return Path(resumed_from.read_text().strip())
     return inside if inside.is_dir() else resume
-
-
-def _has_checkpoint(run: Path) -> bool:
-    return any((run / CHECKPOINTS).glob("step_*"))
 
 
 def write_record(

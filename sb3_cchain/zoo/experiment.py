@@ -140,13 +140,16 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             self.device = checkpoint.device(self.device)
         except ValueError as error:
             sys.exit(f"--resume: {error}")
-        done, final = checkpoint.num_timesteps, checkpoint.folder.parent / f"{self.env_name}.zip"
+        given = self.checkpoints.resume
+        # A run that went on from the checkpoint may be finished without one of its own
+        run = given if given is not None and (given / RESUMED_FROM).is_file() else checkpoint.folder.parent
+        done, final = checkpoint.num_timesteps, run / f"{self.env_name}.zip"
         # One who names a checkpoint wants to go on from there in any case
-        if checkpoint.path != self.checkpoints.resume and final.is_file():
+        if checkpoint.path != given and final.is_file():
             done = saved_timesteps(final)
         if done >= self.n_timesteps:
             print(
-                f"The training in {checkpoint.folder.parent} is finished: it made {done} of {self.n_timesteps} steps. "
+                f"The training in {run} is finished: it made {done} of {self.n_timesteps} steps. "
                 "A greater number of steps makes it longer: -n STEPS"
             )
             sys.exit(0)
