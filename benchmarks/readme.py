@@ -14,11 +14,11 @@ from benchmarks.grid.results import Result, read_results
 from benchmarks.grid.run import ROOT, short_name
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cell, Cells, make_cells
-from benchmarks.report.figures import smoothed
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
 from benchmarks.report.tables import method_label
 from benchmarks.speed.tables import write_tables
+from sb3_cchain.analysis.curves import smoothed
 from sb3_cchain.analysis.plots import import_matplotlib
 
 SUITE, BUDGET = "gym_control", "reduced"

@@ -29,7 +29,7 @@ from benchmarks.report.estimates import (
     reliable_metrics,
     sample,
 )
-from benchmarks.report.figures import band, plot_learning_curves, plot_quantities, smoothed
+from benchmarks.report.figures import plot_learning_curves, plot_quantities
 from benchmarks.report.first_sight import missing_runs, missing_section
 from benchmarks.report.markdown import code, escaped
 from benchmarks.report.page import html_page
@@ -386,19 +386,6 @@ def test_ntk_table_by_hand(tmp_path):
 
 
 # Pictures and page
-
-
-def test_band_by_hand():
-    curves = [(np.array([0.0, 2.0]), np.array([0.0, 2.0])), (np.array([1.0, 3.0]), np.array([3.0, 3.0]))]
-    grid, mean, low, high = band(curves)
-    assert (grid[0], grid[-1]) == (1.0, 2.0)
-    # Values 1 and 3, then 2 and 3: standard errors 1 and 0.5
-    assert (mean[0], low[0], high[0]) == pytest.approx((2.0, 1.0, 3.0))
-    assert (mean[-1], low[-1], high[-1]) == pytest.approx((2.5, 2.0, 3.0))
-    _, mean, low, high = band([(np.array([0.0, 2.0]), np.array([value, value])) for value in (1.0, 100.0)], logarithmic=True)
-    assert (mean[0], low[0], high[0]) == pytest.approx((10.0, 1.0, 100.0))
-    _, mean, low, high = band(curves[:1])
-    assert (low == mean).all() and (high == mean).all()
 
 
 def test_which_task_a_metric_is_of(tmp_path):
@@ -787,15 +774,6 @@ def test_means_and_costs_by_hand(tmp_path):
         ["PPO", "1", "0", "–"],
         ["C-CHAIN PPO", "0", "2", "2.5 GB"],
     ]
-
-
-def test_smoothed_by_hand():
-    assert smoothed(np.array([1.0, 3.0, 8.0, 1.0]), window=2).tolist() == [1.0, 2.0, 5.5, 4.5]
-
-
-def test_band_of_what_has_no_logarithm():
-    _, mean, _, high = band([(np.array([0.0, 1.0]), np.array([0.0, -1e-15]))] * 2, logarithmic=True)
-    assert (0 <= mean).all() and (high < 1e-300).all()
 
 
 def test_what_is_logged_a_rollout_later_counts_where_it_was_made(tmp_path):

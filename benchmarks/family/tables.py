@@ -5,12 +5,12 @@ from statistics import fmean
 from textwrap import fill
 
 import numpy as np
-from scipy.stats import ttest_ind
 
 from benchmarks.family.case import Case
 from benchmarks.family.training import Run, read
 from benchmarks.report.markdown import markdown_table
 from benchmarks.speed.tables import LINE_LENGTH
+from sb3_cchain.analysis.metrics.intervals import difference_interval
 
 # Of the evaluations of each task, the last fifth is its end
 END = 0.2
@@ -89,9 +89,10 @@ def summary_table(cases: Mapping[str, tuple[Case, Evaluations]]) -> str:
 def _compared(before: Sequence[float], after: Sequence[float]) -> tuple[str, str]:
     """Both means, and their difference with its 95 % interval, which is bold where it leaves out 0."""
     means, difference = f"{number(fmean(before))} → {number(fmean(after))}", fmean(after) - fmean(before)
-    if min(len(before), len(after)) < 2 or np.ptp(before) == np.ptp(after) == 0:
+    interval = difference_interval(after, before)
+    if interval is None:
         return means, number(difference)
-    low, high = ttest_ind(after, before, equal_var=False).confidence_interval(0.95)
+    low, high = interval
     text = f"{number(difference)} ({number(low)} to {number(high)})"
     return means, f"**{text}**" if low > 0 or high < 0 else text
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from benchmarks.grid.run import Run, as_json, suite_methods
 from benchmarks.grid.suites import SUITES
+from sb3_cchain.analysis.curves import Series
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 
 METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/")
@@ -41,9 +42,6 @@ RENAMED = {
 
 # No run has so many steps, seeds or seconds
 LARGEST = 2**53
-
-# Environment steps and values of one run
-Series = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)

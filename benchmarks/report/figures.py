@@ -1,7 +1,7 @@
 """All pictures: for each method or variant the mean over its seeds, with a band of its standard error."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,46 +12,14 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.grid.results import Result, Series
+from benchmarks.grid.results import Result
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.quantities import RETURNS, Quantity
 from benchmarks.report.random_policy import TaskLook
+from sb3_cchain.analysis.curves import band, smoothed
 from sb3_cchain.methods.registry import Method
 
-N_POINTS = 100
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
-
-
-def smoothed(values: np.ndarray, window: int) -> np.ndarray:
-    """
-    :param values: A series
-    :param window: Length of the running mean
-    :return: Mean of the last ``window`` values at each point, of fewer at the beginning
-    """
-    sums = np.cumsum(np.insert(values, 0, 0.0))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - window, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
-
-
-def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """
-    :param curves: Environment steps and values of each seed
-    :param logarithmic: Whether mean and standard error are those of the logarithms, which no single seed dominates
-    :return: Where all seeds have values, by interpolation: environment steps, mean, mean - standard error, mean + standard
-        error (the mean itself for a single seed)
-    """
-    start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
-    grid = np.linspace(start, end, N_POINTS if start < end else 1)
-    transform: Callable[[np.ndarray], np.ndarray] = np.asarray
-    inverse = transform
-    if logarithmic:
-        smallest = np.finfo(float).tiny  # in place of 0 and of what rounding made negative
-        transform, inverse = lambda values: np.log(np.maximum(values, smallest)), np.exp
-    seeds = np.array([np.interp(grid, steps, transform(values)) for steps, values in curves])
-    mean = seeds.mean(axis=0)
-    error = seeds.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros_like(mean)
-    return grid, inverse(mean), inverse(mean - error), inverse(mean + error)
 
 
 def plot_learning_curves(

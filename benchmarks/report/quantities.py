@@ -2,7 +2,8 @@
 
 from typing import NamedTuple
 
-from benchmarks.grid.results import Result, Series
+from benchmarks.grid.results import Result
+from sb3_cchain.analysis.curves import Series
 
 RETURN = "return"
 

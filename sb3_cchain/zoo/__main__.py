@@ -11,6 +11,7 @@ COMMANDS = {
     "inspect": "say whether a saved model has lost plasticity, or is ill in another way",
     "record_video": "film a trained agent",
     "record_training": "film how an agent becomes better",
+    "compare": "compare methods by their returns on the tasks: a table, and learning curves",
     "plot_train": "plot the returns of training",
     "all_plots": "compare the evaluations of several runs",
     "plot_from_file": "plot what all_plots has saved",

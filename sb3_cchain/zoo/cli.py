@@ -1,6 +1,6 @@
 """
 The command ``sb3-cchain``: RL Zoo's commands, with the algorithms, related methods and hyperparameters of this package, and
-``sb3-cchain inspect``.
+``sb3-cchain compare`` and ``sb3-cchain inspect``.
 """
 
 import runpy
@@ -27,6 +27,7 @@ except ImportError as error:
 from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.methods.registry import REGISTRY
 from sb3_cchain.replaced import replaced
+from sb3_cchain.zoo import compare
 from sb3_cchain.zoo import inspect as zoo_inspect
 from sb3_cchain.zoo.checkpoint_options import find_resumed, make_parser, take_options
 from sb3_cchain.zoo.experiment import ExperimentManager
@@ -93,6 +94,8 @@ def run(command: str) -> None:
         if command == "inspect":
             if code := zoo_inspect.main(sys.argv[2:]):
                 sys.exit(code)
+        elif command == "compare":
+            compare.main(sys.argv[2:])
         elif command in MODULES:
             run_module(command, playing)
         elif command == "train":

@@ -1,0 +1,115 @@
+"""Methods side by side, by the returns of their runs over the same tasks: a table, and learning curves."""
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from sb3_cchain.analysis.curves import Series, band, smoothed
+from sb3_cchain.analysis.metrics.continual import average_performance
+from sb3_cchain.analysis.metrics.intervals import difference_interval, mean_interval
+from sb3_cchain.analysis.plots import import_matplotlib
+from sb3_cchain.callbacks import task_averages
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# The returns of a run: rows of `returns.csv`
+Rows = Sequence[Mapping[str, float]]
+# By its label, the runs of each method
+Methods = Mapping[str, Sequence[Rows]]
+
+
+def common_tasks(methods: Methods) -> list[int]:
+    """
+    :param methods: By label, the rows of ``returns.csv`` of each run
+    :return: The tasks that all runs have returns on, in their order
+    :raises ValueError: When there is none
+    """
+    tasks = [list(dict.fromkeys(int(row["task_id"]) for row in rows)) for runs in methods.values() for rows in runs]
+    common = [task for task in tasks[0] if all(task in others for others in tasks)]
+    if not common:
+        raise ValueError(f"The runs must have a task in common; got the tasks {'; '.join(map(str, tasks))}")
+    return common
+
+
+def comparison_table(methods: Methods) -> Table:
+    r"""
+    :param methods: By label, the rows of ``returns.csv`` of each run; differences are from the first
+    :return: For each method the number of runs, the mean return on each task that all runs have, and :math:`J(\mathbb{T})`,
+        their mean: its mean over the runs with its 95 % interval, by Student's t, and how much more it is than that of the
+        first method, by Welch's t-test. There are no intervals for a single run, or where all runs are alike
+    :raises ValueError: When the runs have no task in common
+    :raises ImportError: Without SciPy
+    """
+    tasks = common_tasks(methods)
+    # By label: the return on each task, of each run, (n_runs, n_tasks)
+    returns = {
+        label: np.array([[task_averages(rows)[task] for task in tasks] for rows in runs]) for label, runs in methods.items()
+    }
+    scores = {label: [average_performance(averages) for averages in each] for label, each in returns.items()}
+    first, *_ = methods
+    table = Table(box=box.ASCII)
+    table.add_column("task")
+    for label in methods:
+        table.add_column(label, justify="right", overflow="fold")
+    table.add_row("runs", *(str(len(runs)) for runs in methods.values()), end_section=True)
+    for i, task in enumerate(tasks):
+        table.add_row(str(task), *(f"{each[:, i].mean():.4g}" for each in returns.values()), end_section=task == tasks[-1])
+    table.add_row("J(T)", *(f"{np.mean(each):.4g}" for each in scores.values()))
+    table.add_row("95 % interval", *(_interval_text(mean_interval(each)) for each in scores.values()), end_section=True)
+    if len(methods) > 1:
+        others = [scores[label] for label in methods if label != first]
+        table.add_row(f"minus {first}", "", *(f"{np.mean(each) - np.mean(scores[first]):.4g}" for each in others))
+        intervals = [difference_interval(each, scores[first]) for each in others]
+        table.add_row("95 % interval", "", *map(_interval_text, intervals))
+    return table
+
+
+def _interval_text(interval: tuple[float, float] | None) -> str:
+    return "" if interval is None else "{:.4g} to {:.4g}".format(*interval)
+
+
+def draw_comparison(methods: Methods, window: int) -> "Figure":
+    """
+    Draw returns against environment steps: of each method a line for the mean over its runs, and a band of its standard error;
+    dashed lines where the task switches.
+
+    :param methods: By label, the rows of ``returns.csv`` of each run
+    :param window: Rows that the running mean goes over, inside a task
+    :return: The picture
+    :raises ImportError: Without matplotlib
+    """
+    matplotlib = import_matplotlib()
+    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
+        figure: Figure = matplotlib.figure.Figure(figsize=(9, 4), dpi=100, layout="constrained")
+        axes = figure.add_subplot()
+        curves = {label: [_curves(rows, window) for rows in runs] for label, runs in methods.items()}
+        for number, (label, runs) in enumerate(curves.items()):
+            name: str | None = f"{label}, {len(runs)} run{'s' * (len(runs) > 1)}"
+            for curves_in_task in zip(*runs, strict=False):  # as many tasks as all runs have reached
+                grid, mean, low, high = band(curves_in_task)
+                axes.plot(grid, mean, color=f"C{number}", linewidth=1.8, marker="o" * (len(grid) == 1), label=name)
+                axes.fill_between(grid, low, high, color=f"C{number}", alpha=0.2, linewidth=0)
+                name = None  # once in the legend
+        longest = max((run for runs in curves.values() for run in runs), key=len)
+        for steps, _ in longest[:-1]:
+            axes.axvline(steps[-1], color="0.35", linestyle="--", linewidth=1)
+        smoothing = f", running mean of {window} rows" if window > 1 else ""
+        axes.set(xlabel="environment steps", ylabel=f"mean return{smoothing}")
+        axes.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))  # 20k, 1M
+        axes.spines[["top", "right"]].set_visible(False)
+        figure.legend(loc="outside lower center", ncols=min(len(methods), 4), frameon=False)
+    return figure
+
+
+def _curves(rows: Rows, window: int) -> list[Series]:
+    """The curve of each task, in the order of training; a task that comes back has several."""
+    tasks = [list(rows_of_task) for _, rows_of_task in groupby(rows, key=lambda row: row["task_id"])]
+    return [
+        (np.array([row["timesteps"] for row in each]), smoothed(np.array([row["mean_return"] for row in each]), window))
+        for each in tasks
+    ]

@@ -1,0 +1,46 @@
+"""What learning curves of several seeds are drawn from: running means, and the band around their mean."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+# Environment steps and values of one run
+Series = tuple[Array, Array]
+
+N_POINTS = 100
+
+
+def smoothed(values: Array, window: int) -> Array:
+    """
+    :param values: A series
+    :param window: Length of the running mean
+    :return: Mean of the last ``window`` values at each point, of fewer at the beginning
+    """
+    sums = np.cumsum(np.insert(values, 0, 0.0))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[Array, Array, Array, Array]:
+    """
+    :param curves: Environment steps and values of each seed
+    :param logarithmic: Whether mean and standard error are those of the logarithms, which no single seed dominates
+    :return: Where all seeds have values, by interpolation: environment steps, mean, mean - standard error, mean + standard
+        error (the mean itself for a single seed)
+    """
+    start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    grid = np.linspace(start, end, N_POINTS if start < end else 1)
+    transform: Callable[[Array], Array] = np.asarray
+    inverse = transform
+    if logarithmic:
+        smallest = np.finfo(float).tiny  # in place of 0 and of what rounding made negative
+        transform, inverse = lambda values: np.log(np.maximum(values, smallest)), np.exp
+    seeds = np.array([np.interp(grid, steps, transform(values)) for steps, values in curves])
+    mean = seeds.mean(axis=0)
+    error = seeds.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros_like(mean)
+    return grid, inverse(mean), inverse(mean - error), inverse(mean + error)

@@ -1,0 +1,127 @@
+"""The command ``sb3-cchain compare``."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison
+from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
+from sb3_cchain.checkpoint import check_writable
+
+# A run that is this much shorter than the longest is not of the same length: episodes end a little before the last step
+SHORT = 0.95
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    :return: The parser of the command line
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-cchain compare",
+        description="Compare methods by the returns of their runs over the same tasks: the mean return on each task, "
+        "J(T) with its 95 %% interval, and how much more it is than that of the first method.",
+    )
+    parser.add_argument(
+        "-r",
+        "--runs",
+        nargs="+",
+        action="append",
+        required=True,
+        metavar=("LABEL", "PATH"),
+        help=f"A method: its label, and files {RETURNS_CSV} of its runs, or folders that have such files at any depth; once "
+        "for each method. A file that is the beginning of another, such as that of a run that was resumed, is left out",
+    )
+    parser.add_argument("-o", "--output", type=Path, help="Picture of the learning curves, such as comparison.png")
+    parser.add_argument(
+        "-w", "--window", type=int, default=10, help="Rows of the files that the running mean of the curves goes over"
+    )
+    return parser
+
+
+def main(arguments: Sequence[str]) -> None:
+    """
+    :param arguments: Of the command line, after ``compare``
+    """
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    check_arguments(parser, args)
+    console = Console()
+    try:
+        methods = {label: read_runs(paths, console) for label, *paths in args.runs}
+        print_lengths(methods, console)
+        returns = {label: list(runs.values()) for label, runs in methods.items()}
+        console.print(comparison_table(returns))
+        if args.output is not None:
+            draw_comparison(returns, args.window).savefig(args.output)
+            console.print(f"Written: {args.output}", soft_wrap=True)
+    except (ImportError, OSError, ValueError) as error:
+        parser.error(str(error))
+
+
+def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """
+    End with an error in one line where arguments are wrong.
+
+    :param parser: The parser of the command line
+    :param args: Its arguments
+    """
+    labels = [label for label, *_ in args.runs]
+    for label, *paths in args.runs:
+        if not paths:
+            parser.error(f"--runs must have a label and at least one path; got {label}")
+        if labels.count(label) > 1:
+            parser.error(f"--runs must have another label for each method; got {label} {labels.count(label)} times")
+    if args.window < 1:
+        parser.error(f"--window must be at least 1; got {args.window}")
+    if args.output is not None:
+        try:
+            check_writable(args.output.parent)
+        except OSError as error:
+            parser.error(f"--output {args.output}: {error.strerror}. Give a path in a folder that can be written to")
+
+
+def read_runs(paths: Sequence[str], console: Console) -> dict[Path, Rows]:
+    """
+    :param paths: Files of returns, or folders that have them
+    :param console: Where it is said which files are left out
+    :return: The rows of each run, by file
+    :raises ValueError: When there is no such file, or it is damaged
+    """
+    files: dict[Path, Rows] = {}
+    for path in map(Path, paths):
+        found = sorted(path.rglob(RETURNS_CSV)) if path.is_dir() else [path]
+        if not found:
+            raise ValueError(f"{path} must be a file of returns or have {RETURNS_CSV} in it, which training with -tb writes")
+        files.update({file.resolve(): read_returns(file) for file in found})
+    runs: dict[Path, Rows] = {}
+    for file, rows in sorted(files.items(), key=lambda item: len(item[1]), reverse=True):
+        longer = next((other for other, its_rows in runs.items() if its_rows[: len(rows)] == rows), None)
+        if not rows or longer is not None:
+            why = f"the beginning of {longer}" if rows else "without a row"
+            console.print(f"Left out: {file}, {why}", soft_wrap=True, highlight=False)
+        else:
+            runs[file] = rows
+    if not runs:
+        raise ValueError(f"No episode has ended yet in the runs {', '.join(paths)}")
+    return runs
+
+
+def print_lengths(methods: dict[str, dict[Path, Rows]], console: Console) -> None:
+    """
+    Name the runs that are shorter than the others.
+
+    :param methods: The rows of each run, by label and file
+    :param console: Where
+    """
+    ends = {file: int(rows[-1]["timesteps"]) for runs in methods.values() for file, rows in runs.items()}
+    longest = max(ends.values())
+    for file, end in ends.items():
+        if end < SHORT * longest:
+            console.print(
+                f"Shorter: {file} ends at step {end:,} of {longest:,}. The tasks that all runs have are compared, the last of "
+                "them perhaps in part",
+                soft_wrap=True,
+                highlight=False,
+            )
