@@ -1,9 +1,9 @@
 """Double DQN with churn reduction."""
 
-from typing import Any, TypeVar
+from typing import Any
 
 import torch as th
-from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSamples
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
@@ -15,8 +15,6 @@ from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.policy_outputs import has_training_mode
 from sb3_cchain.validation import check_choice
-
-SelfCChainDQN = TypeVar("SelfCChainDQN", bound="CChainDQN")
 
 
 class CChainDQN(ChurnAlgorithm, DoubleDQN):
@@ -151,25 +149,3 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
             previous_values = None if previous is None else self.q_net(previous)
             with th.no_grad():
                 return QValues(current, next_values, self.q_net(reference), previous_values)
-
-    def learn(
-        self: SelfCChainDQN,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "CChainDQN",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCChainDQN:
-        """
-        As DQN's. In a continual environment the callbacks that follow its tasks are added.
-
-        :param total_timesteps: Environment steps to train for
-        :param callback: Callback(s) called at every step
-        :param log_interval: Episodes between two logs
-        :param tb_log_name: Name of the run in TensorBoard
-        :param reset_num_timesteps: Whether to count environment steps from 0
-        :param progress_bar: Whether to show a progress bar
-        :return: The trained model
-        """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -1,18 +1,15 @@
 """PPO with churn reduction."""
 
 from contextlib import nullcontext
-from typing import Any, TypeVar
+from typing import Any
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.networks.lean_distributions import make_lean
 from sb3_cchain.networks.lean_forward import lean_forward
 from sb3_cchain.validation import check_bool
-
-SelfCChainPPO = TypeVar("SelfCChainPPO", bound="CChainPPO")
 
 
 class CChainPPO(ChurnAlgorithm, PPO):
@@ -111,25 +108,3 @@ class CChainPPO(ChurnAlgorithm, PPO):
         """
         with lean_forward(self.policy) if self.lean else nullcontext():
             return super().collect_rollouts(*args, **kwargs)
-
-    def learn(
-        self: SelfCChainPPO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "CChainPPO",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCChainPPO:
-        """
-        As PPO's. In a continual environment the callbacks that follow its tasks are added.
-
-        :param total_timesteps: Environment steps to train for
-        :param callback: Callback(s) called at every step
-        :param log_interval: Iterations between two logs
-        :param tb_log_name: Name of the run in TensorBoard
-        :param reset_num_timesteps: Whether to count environment steps from 0
-        :param progress_bar: Whether to show a progress bar
-        :return: The trained model
-        """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
