@@ -132,5 +132,5 @@ def test_bad_arguments(kwargs, message):
 
 
 def test_games_cannot_be_blended():
-    with pytest.raises(TypeError, match="blend_steps"):
+    with pytest.raises(ValueError, match="`blend_steps` must be 0 for ContinualMinAtar, got 10"):
         gym.make("Continual/MinAtar-v0", blend_steps=10)

@@ -44,10 +44,7 @@ class ContinualAtari(ContinualEnv[NDArray[np.uint8], np.int64]):
         ``{"game": "Freeway", "mode": 1, "difficulty": 0}``. Read back as the attribute ``atari_tasks``
     :param steps_per_task: Environment steps (of 4 frames) per task, one number for all or one per task
     :param repeat_action_probability: Probability that a frame repeats the action before
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`
     :raises TypeError: When ``tasks`` is a string or not a list
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When the Arcade Learning Environment or OpenCV is not installed
@@ -62,16 +59,13 @@ class ContinualAtari(ContinualEnv[NDArray[np.uint8], np.int64]):
         *,
         steps_per_task: int | Sequence[int] = 12_500_000,
         repeat_action_probability: float = 0.25,
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         self.atari_tasks = [_read_task(position, task) for position, task in enumerate(check_list("tasks", tasks, "games"))]
         check_number("repeat_action_probability", repeat_action_probability, 0, 1)
         settings = {"repeat_action_probability": repeat_action_probability}
         makers = [partial(_make_task, task, **settings) for task in self.atari_tasks]
-        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(makers, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[tuple[str, int | None, int | None]]:

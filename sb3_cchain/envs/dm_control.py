@@ -81,10 +81,7 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating[A
     :param domain: The robot: a domain of dm_control's suite
     :param tasks: Tasks of the domain in order; one may come again. Read back as the attribute ``task_names``
     :param steps_per_task: Environment steps per task, one number for all or one per task
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`
     :raises TypeError: When ``tasks`` is a string or not a list
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When dm_control or Shimmy is not installed
@@ -96,14 +93,11 @@ class ContinualDMControl(ContinualEnv[NDArray[np.float32], NDArray[np.floating[A
         tasks: Sequence[str] = ("stand", "walk", "run"),
         *,
         steps_per_task: int | Sequence[int] = 1_000_000,
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         self.domain, self.task_names = domain, _check_task_names(domain, tasks)
         makers = [partial(_make_task, domain, name) for name in self.task_names]
-        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(makers, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[tuple[str, str]]:

@@ -69,12 +69,9 @@ class ContinualGymControl(ContinualEnv):
     :param offset_std: σ
     :param offset_seed: Seed of the offsets. They do not depend on ``reset(seed=...)``
     :param offsets: The offsets themselves, ``(n_tasks, *observation_shape)``; read back as the attribute ``offsets``
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`; ``n_tasks`` and ``offsets`` are of one cycle
-    :param blend_steps: See :class:`~sb3_cchain.ContinualEnv`. The offset goes from that of the task before to the task's own
-        in a straight line
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``blend_steps``, ``render_mode``: see
+        :class:`~sb3_cchain.ContinualEnv`. ``n_tasks`` and ``offsets`` are of one cycle. With ``blend_steps``, the offset goes
+        from that of the task before to the task's own in a straight line
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When the package that the environment needs is not installed
     """
@@ -88,11 +85,7 @@ class ContinualGymControl(ContinualEnv):
         offset_std: float = 2.0,
         offset_seed: int = 0,
         offsets: ArrayLike | None = None,
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        blend_steps: int = 0,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         check_number("n_tasks", n_tasks, 1, integer=True)
         check_number("offset_std", offset_std, 0)
@@ -105,15 +98,7 @@ class ContinualGymControl(ContinualEnv):
         else:
             self.offsets = _read_offsets(offsets, shape)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
-        super().__init__(
-            tasks,
-            steps_per_task,
-            n_envs=n_envs,
-            first_task=first_task,
-            cycles=cycles,
-            blend_steps=blend_steps,
-            render_mode=render_mode,
-        )
+        super().__init__(tasks, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[tuple[str, list[float]]]:

@@ -156,10 +156,7 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
     :param n_channels: Channels of the observations after padding; the games have 4, 4, 7, 10 and 6
     :param sticky_action_prob: Probability that a step repeats the action before instead of taking the one given
     :param difficulty_ramping: Whether Asterix, Seaquest and SpaceInvaders get harder during an episode
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`
     :raises TypeError: When ``games`` is a string or not a list, or ``difficulty_ramping`` is not a boolean
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When MinAtar is not installed
@@ -173,17 +170,14 @@ class ContinualMinAtar(ContinualEnv[NDArray[np.bool_], np.int64]):
         n_channels: int = 10,
         sticky_action_prob: float = 0.1,
         difficulty_ramping: bool = True,
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         self.games = _check_games(games)
         check_number("sticky_action_prob", sticky_action_prob, 0, 1)
         check_bool("difficulty_ramping", difficulty_ramping)
         settings = {"sticky_action_prob": sticky_action_prob, "difficulty_ramping": difficulty_ramping}
         tasks = [partial(_make_game, game, n_channels, **settings) for game in self.games]
-        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(tasks, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[str]:

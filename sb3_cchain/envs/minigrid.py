@@ -26,10 +26,7 @@ class ContinualMiniGrid(ContinualEnv[NDArray[np.uint8], np.int64]):
     :param observations: What the agent sees of the 7 × 7 cells before it. ``"one_hot"``: object, colour and state of each cell
         one-hot, in one vector of 980 numbers, for MLP policies. ``"image"``: their numbers, ``(7, 7, 3)``, for a feature
         extractor of one's own. The mission, a sentence, is left out
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`
     :raises TypeError: When ``tasks`` is a string or not a list
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When MiniGrid is not installed
@@ -41,16 +38,13 @@ class ContinualMiniGrid(ContinualEnv[NDArray[np.uint8], np.int64]):
         *,
         steps_per_task: int | Sequence[int] = 250_000,
         observations: str = "one_hot",
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         self.task_names = check_list("tasks", tasks, of="ids of MiniGrid's environments")
         check_choice("observations", observations, ("one_hot", "image"))
         self.observations = observations
         makers = [partial(_make_task, name, observations) for name in self.task_names]
-        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(makers, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[str]:

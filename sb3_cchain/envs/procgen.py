@@ -239,10 +239,8 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
     :param first_level: The first level of the first task; read back, with all others, as the attribute ``levels``
     :param num_levels: Levels per task, from which the level of each episode is drawn
     :param distribution_mode: See :class:`~sb3_cchain.envs.ProcgenGame`
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: ``"rgb_array"`` or ``None``; ``gymnasium.make`` takes ``"human"`` too
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`. A render
+        mode is ``"rgb_array"``; ``gymnasium.make`` takes ``"human"`` too
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When procgen is not installed
     """
@@ -258,10 +256,7 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
         first_level: int = 20,
         num_levels: int = 1,
         distribution_mode: str = "hard",
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         _check_game(game, distribution_mode)
         check_number("n_tasks", n_tasks, 1, integer=True)
@@ -272,7 +267,7 @@ class ContinualProcgen(ContinualEnv[NDArray[np.uint8], np.int64]):
         self.levels = [range(start, start + int(num_levels)) for start in starts]
         make_task = partial(ProcgenGame, game, num_levels=num_levels, distribution_mode=distribution_mode)
         tasks = [partial(make_task, start_level=start) for start in starts]
-        super().__init__(tasks, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(tasks, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[tuple[str, int, int]]:

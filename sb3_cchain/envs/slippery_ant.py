@@ -26,12 +26,9 @@ class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating
     :param friction_range: The least and the greatest friction that can be drawn
     :param friction_seed: Seed of the frictions. They do not depend on ``reset(seed=...)``
     :param frictions: The frictions themselves, ``(n_tasks,)``; read back as the attribute ``frictions``. Gymnasium's own is 1
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`; ``n_tasks`` and ``frictions`` are of one cycle
-    :param blend_steps: See :class:`~sb3_cchain.ContinualEnv`. The logarithm of the friction goes from that of the task before
-        to the task's own in a straight line
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``blend_steps``, ``render_mode``: see
+        :class:`~sb3_cchain.ContinualEnv`. ``n_tasks`` and ``frictions`` are of one cycle. With ``blend_steps``, the logarithm
+        of the friction goes from that of the task before to the task's own in a straight line
     :raises ValueError: Naming the argument that is out of its range
     :raises ImportError: When MuJoCo is not installed
     """
@@ -44,11 +41,7 @@ class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating
         friction_range: Sequence[float] = (0.02, 2.0),
         friction_seed: int = 0,
         frictions: ArrayLike | None = None,
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        blend_steps: int = 0,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         check_number("n_tasks", n_tasks, 1, integer=True)
         check_number("friction_seed", friction_seed, 0, integer=True)
@@ -58,15 +51,7 @@ class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating
         else:
             self.frictions = _read_frictions(frictions, n_tasks)
         tasks = [partial(_make_task, friction) for friction in self.frictions.tolist()]
-        super().__init__(
-            tasks,
-            steps_per_task,
-            n_envs=n_envs,
-            first_task=first_task,
-            cycles=cycles,
-            blend_steps=blend_steps,
-            render_mode=render_mode,
-        )
+        super().__init__(tasks, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[float]:

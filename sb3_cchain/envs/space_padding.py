@@ -113,10 +113,7 @@ class ContinualSequence(ContinualEnv[NDArray[np.float32], Any]):
     :param observation_size: Numbers in an observation after padding; None for as many as the longest has
     :param n_actions: Actions to choose from; None for as many as the environment with the most has
     :param extra_actions: See :class:`~sb3_cchain.envs.CommonSpaces`
-    :param n_envs: See :class:`~sb3_cchain.ContinualEnv`
-    :param first_task: See :class:`~sb3_cchain.ContinualEnv`
-    :param cycles: See :class:`~sb3_cchain.ContinualEnv`
-    :param render_mode: As in :func:`gymnasium.make`
+    :param kwargs: ``n_envs``, ``first_task``, ``cycles``, ``render_mode``: see :class:`~sb3_cchain.ContinualEnv`
     :raises TypeError: When ``env_ids`` is a string or not a list, or an environment's spaces cannot be padded
     :raises ValueError: Naming the argument that is out of its range, or the environments that do not fit together
     :raises ImportError: When the package that an environment needs is not installed
@@ -130,10 +127,7 @@ class ContinualSequence(ContinualEnv[NDArray[np.float32], Any]):
         observation_size: int | None = None,
         n_actions: int | None = None,
         extra_actions: str = "first",
-        n_envs: int = 1,
-        first_task: int = 0,
-        cycles: int = 1,
-        render_mode: str | None = None,
+        **kwargs: Any,
     ):
         self.env_ids = check_list("env_ids", env_ids, of="environment ids")
         if observation_size is None or n_actions is None:
@@ -143,7 +137,7 @@ class ContinualSequence(ContinualEnv[NDArray[np.float32], Any]):
             if n_actions is None:
                 n_actions = max((number for _, number in sizes), default=1)
         makers = [partial(_make_task, env_id, observation_size, n_actions, extra_actions) for env_id in self.env_ids]
-        super().__init__(makers, steps_per_task, n_envs=n_envs, first_task=first_task, cycles=cycles, render_mode=render_mode)
+        super().__init__(makers, steps_per_task, **kwargs)
 
     @property
     def task_sequence(self) -> list[str]:
