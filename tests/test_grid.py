@@ -23,7 +23,7 @@ from benchmarks.grid.attempts import Attempt, new_attempt
 from benchmarks.grid.executor import RETRIES, LocalBackend, complete, gpu_places
 from benchmarks.grid.plan import Rates, grid_runs, run_length
 from benchmarks.grid.ray_backend import RayBackend, count_slots
-from benchmarks.grid.results import METRIC_PREFIXES, RENAMED, Result, find_result, read_result, read_results, write_result
+from benchmarks.grid.results import METRIC_PREFIXES, Result, find_result, read_result, read_results, write_result
 from benchmarks.grid.run import (
     ROOT,
     Run,
@@ -153,25 +153,6 @@ def test_a_variant_has_a_folder_of_its_own(tmp_path):
         write_result(make_result(tmp_path, run), ROWS, [])
     assert find_result(variant, tmp_path).path == tmp_path / "smoke/gym_control/Continual-CartPole-v1/orthogonal/seed_0"
     assert find_result(variant, tmp_path).overrides == variant.overrides and find_result(RUN, tmp_path).line == "cchain"
-
-
-def test_older_results_are_read(tmp_path):
-    """They say "budget", have the evaluations in their command alone, and old names of classes."""
-    run = Run("minatar", "Continual/MinAtar-v0", "oracle", 0, 2, 800, "smoke", eval_freq=400)
-    result = make_result(tmp_path, run, command=["sb3-cchain", "train", "--eval-freq", "400"])
-    write_result(result, ROWS, [])
-    file = result.path / "run.json"
-    fields = {name: value for name, value in json.loads(file.read_text()).items()}
-    for name in ("eval_freq", "variant", "overrides"):
-        del fields[name]
-    fields["budget"] = fields.pop("experiment")
-    text = json.dumps(fields)
-    for old, new in RENAMED.items():
-        text = text.replace(new, old)
-    assert "sb3_cchain.baselines.Oracle" in text and "sb3_cchain.common." in text
-    file.write_text(text)
-    # Several old names may have become one new name
-    assert find_result(run, tmp_path) == result and find_result(replace(run, eval_freq=800), tmp_path) is None
 
 
 def test_the_committed_results_count(capsys):

@@ -33,13 +33,6 @@ from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
 METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/")
 METRICS_COLUMNS = ("timesteps", "name", "value")
 
-# Names that classes had in the hyperparameters of older results
-RENAMED = {
-    "sb3_cchain.baselines.": "sb3_cchain.methods.",
-    "sb3_cchain.common.policies.": "sb3_cchain.networks.",
-    "sb3_cchain.common.torch_layers.": "sb3_cchain.networks.",
-}
-
 # No run has so many steps, seeds or seconds
 LARGEST = 2**53
 
@@ -157,8 +150,7 @@ def read_result(path: Path) -> Result | None:
     """
     file = path / "run.json"
     try:
-        fields = _translated(json.loads(file.read_text()))
-        result = Result(path=path, **fields)
+        result = Result(path=path, **_fields(json.loads(file.read_text())))
         _check(result)
     except (FileNotFoundError, NotADirectoryError):
         return None
@@ -202,33 +194,13 @@ def read_results(folder: Path) -> tuple[list[Result], dict[Path, str]]:
     return results, left_out
 
 
-def _translated(fields: dict[str, Any]) -> dict[str, Any]:
+def _fields(saved: dict[str, Any]) -> dict[str, Any]:
     """
-    The fields of :class:`Result`, from those of a ``run.json`` of this or an older version: older ones say ``budget`` for
-    ``experiment``, have ``eval_freq`` in their command only, and name classes as they were named then. What follows from other
-    fields is dropped.
+    :param saved: What ``run.json`` holds
+    :return: The fields of :class:`Result`, but for its path
     """
-    fields = {name: value for name, value in fields.items() if name not in ("algo", "task_boundaries", "steps_per_second")}
-    if "budget" in fields:
-        fields["experiment"] = fields.pop("budget")
-        command = fields["command"]
-        fields["eval_freq"] = int(command[command.index("--eval-freq") + 1]) if "--eval-freq" in command else -1
-    fields["hyperparameters"] = _renamed(fields.get("hyperparameters"))
-    if isinstance(fields.get("overrides"), list):
-        fields["overrides"] = tuple(fields["overrides"])
-    return fields
-
-
-def _renamed(value: Any) -> Any:
-    """Hyperparameters with the present names of classes."""
-    if isinstance(value, dict):
-        return {_renamed(name): _renamed(entry) for name, entry in value.items()}
-    if isinstance(value, list):
-        return [_renamed(entry) for entry in value]
-    if isinstance(value, str):
-        for old, new in RENAMED.items():
-            value = value.replace(old, new)
-    return value
+    fields = {name: value for name, value in saved.items() if name not in ("algo", "task_boundaries", "steps_per_second")}
+    return {**fields, "overrides": tuple(fields.get("overrides", ()))}
 
 
 def _check(result: Result) -> None:
