@@ -137,7 +137,7 @@ def assert_equal(model, other):
     # The state of a model that a stock algorithm loaded is a dict
     states = [getattr(each, "churn_state", None) for each in (model, other)]
     if all(isinstance(state, ChurnState) for state in states):
-        assert states[0].reducer.coefficient.value == states[1].reducer.coefficient.value
+        assert states[0].reducers.first.coefficient.value == states[1].reducers.first.coefficient.value
 
 
 def assert_close(model, other, atol):
@@ -148,7 +148,7 @@ def assert_close(model, other, atol):
 
 def state_of(model):
     """Parameters, and C-CHAIN's numbers."""
-    coefficient = model.churn_state.reducer.coefficient.state_dict() if hasattr(model, "churn_state") else {}
+    coefficient = model.churn_state.reducers.first.coefficient.state_dict() if hasattr(model, "churn_state") else {}
     return [tensor.clone() for tensor in (*model.policy.state_dict().values(), *coefficient.values())]
 
 

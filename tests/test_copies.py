@@ -71,7 +71,8 @@ def test_a_copy_that_is_made_in_training_trains_itself():
 def test_an_untrained_copy_has_a_reducer_of_its_own(make):
     model = make()
     other = copy.deepcopy(model)
-    assert other.churn_state.model is other and other.churn_state.reducer is other.churn_reducer is not model.churn_reducer
+    assert other.churn_state.model is other and other.churn_state.reducers is other.churn_reducers
+    assert other.churn_reducer is not model.churn_reducer
     other.learn(48)
     assert int(other.churn_reducer.coefficient.n_seen) > 0 == int(model.churn_reducer.coefficient.n_seen)
 

@@ -120,7 +120,7 @@ def test_logs_to_csv(form, tmp_path):
 def test_an_infinite_churn_loss_is_named_before_an_update(form):
     model, callback = form.make()
     model.learn(form.n_timesteps, callback)
-    model.churn_state.reducer.old_outputs.fill_(float("nan"))
+    model.churn_state.reducers.first.old_outputs.fill_(float("nan"))
     before = state_of(model)
     with pytest.raises(ValueError, match="The churn loss is nan"):
         model.learn(form.n_timesteps, callback)
@@ -129,7 +129,7 @@ def test_an_infinite_churn_loss_is_named_before_an_update(form):
     buffer = getattr(model, "rollout_buffer", None) or model.replay_buffer
     left = {*vars(model), *vars(model.policy.optimizer), *vars(buffer)}
     assert not {"train", "_excluded_save_params", "zero_grad", "get"} & left
-    model.churn_state.reducer.forget_reference()
+    model.churn_state.reducers.first.forget_reference()
     model.learn(form.n_timesteps)
 
 

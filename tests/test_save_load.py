@@ -17,7 +17,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
-from sb3_cchain.algorithms.churn_state import keep_churn_state
 from tests.churn_models import (
     ACTION_SPACES,
     ALGORITHMS,
@@ -87,20 +86,8 @@ def test_continues_as_if_never_stopped(tmp_path, name, action_space, observation
     assert (model.num_timesteps, model._n_updates) == (loaded.num_timesteps, loaded._n_updates)
     assert differ(forgetful, loaded)
     # λ had adapted
-    coefficient = model.churn_state.reducer.coefficient
+    coefficient = model.churn_state.reducers.first.coefficient
     assert coefficient.value != 1 and coefficient.base_losses.all()
-
-
-@pytest.mark.parametrize("name", ["CChainPPO", "CChainDQN"])
-def test_state_of_an_earlier_version_is_taken(name):
-    """It had one reducer, without a name."""
-    model, fresh = learn(FORMS[name]), FORMS[name].make(**ADAPTIVE)[0]
-    past = model.churn_state.as_dict()
-    (past["reducer"],) = past.pop("reducers").values()
-    keep_churn_state(fresh, fresh.churn_reducers, fresh._task_switch, past, model._n_updates)
-    assert fresh.churn_reducer.coefficient.n_seen == model.churn_reducer.coefficient.n_seen > 0
-    assert fresh.churn_reducer.coefficient.value == model.churn_reducer.coefficient.value
-    assert fresh.churn_reducer.reference is not None
 
 
 def test_a_minibatch_that_was_drawn_ahead_is_not_saved(tmp_path):
@@ -300,8 +287,8 @@ def test_saved_again_by_a_stock_algorithm_the_history_is_kept(form, tmp_path):
         if form.callback:
             again.set_logger(configure(None, []))
             form.callback(**ADAPTIVE).init_callback(again)
-        reducer = again.churn_state.reducer
-        assert reducer.coefficient.value == model.churn_state.reducer.coefficient.value != 1
+        reducer = again.churn_state.reducers.first
+        assert reducer.coefficient.value == model.churn_state.reducers.first.coefficient.value != 1
         # What changed on the reference batch in training without churn reduction is no churn
         assert (reducer.reference is not None) == has_reference
 

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_cchain.churn import ChurnReducer, ChurnReducers
+from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.tasks.signal import TaskSwitch
 
 
@@ -26,11 +26,6 @@ class ChurnState:
         self.task_switch = task_switch
         # `model._n_updates` after the last training with churn reduction; None for models that always train with it
         self.n_updates: int | None = None
-
-    @property
-    def reducer(self) -> ChurnReducer:
-        """The only churn reducer, or the first of several."""
-        return self.reducers.first
 
     def as_dict(self) -> dict[str, Any]:
         """
@@ -70,11 +65,9 @@ def keep_churn_state(
         past = past.as_dict()
     if past is not None:
         task_switch.task_id = past["task_id"]
-        # Earlier versions had one reducer, and saved it without a name
-        saved_reducers = past["reducers"] if "reducers" in past else {next(iter(reducers)): past["reducer"]}
-        for name in reducers.keys() & saved_reducers.keys():
+        for name in reducers.keys() & past["reducers"].keys():
             reducer = reducers[name]
-            saved, fresh = saved_reducers[name], reducer.state_dict()
+            saved, fresh = past["reducers"][name], reducer.state_dict()
             same_kind = _shapes(saved) == _shapes(fresh)
             reducer.load_state_dict(saved if same_kind else {**fresh, "_extra_state": saved["_extra_state"]})
             reducer.move_reference(model.device)

@@ -54,8 +54,6 @@ class TaskVecNormalize(VecNormalize):
     statistics: ClassVar[frozenset[str]] = frozenset({"obs_rms", "ret_rms", "_switch", "_signal_switch"})
 
     venv: VecEnv
-    # Those that were saved by an earlier version do not have it
-    returns_over_cuts: bool = False
 
     def __init__(
         self,

@@ -161,7 +161,7 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     if seed.parse_known_args(arguments)[0].seed < 0:  # RL Zoo would draw one
         arguments = [*arguments, "--seed", str(record["options"]["seed"])]
     freq = options.freq or record["checkpoint_freq"]
-    keep = options.keep or record.get("checkpoint_keep", KEEP)  # earlier versions did not write it
+    keep = options.keep or record["checkpoint_keep"]
     exact = options.exact and checkpoint.info["training_checkpoint"]["exact"]
     return options._replace(freq=freq, keep=keep, exact=exact, checkpoint=checkpoint, record=record), arguments
 
