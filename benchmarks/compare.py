@@ -12,10 +12,8 @@ from pathlib import Path
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.run import make_run, suite_methods
 from benchmarks.grid.suites import SUITES, check_env_id, paper_length
-from benchmarks.report.figures import plot_learning_curves
-from benchmarks.report.markdown import markdown_table
+from benchmarks.report.comparison import write_comparison
 from benchmarks.report.random_policy import look_at_task
-from benchmarks.report.task_tables import average_cells, cost_table, mean_rows, returns_header, returns_rows
 
 
 def main() -> None:
@@ -55,15 +53,8 @@ def main() -> None:
         parser.error(str(error))
     results = train_all(runs, args.output, args.jobs)
 
-    lines = suite_methods(args.suite)
     looks = [look_at_task(runs[0], task, args.random_episodes) for task in range(n_tasks)]
-    rows = [*returns_rows(results, lines), *mean_rows(results, lines)]
-    rows.append(["random policy", "", *average_cells([look.random_return for look in looks])])
-    tables = f"{markdown_table(returns_header(results[0].task_names), rows)}\n\n{cost_table(results, lines)}"
-    folder = results[0].path.parents[1]
-    (folder / "table.md").write_text(tables + "\n")
-    plot_learning_curves(results, folder / "curves.png", lines, env_id, looks)
-    print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")
+    write_comparison(results, suite_methods(args.suite), looks)
 
 
 if __name__ == "__main__":

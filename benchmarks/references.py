@@ -7,16 +7,12 @@ trains, and writes a table and learning curves for each environment. The same co
 """
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
-from benchmarks.grid.arguments import add_variant_arguments
 from benchmarks.grid.executor import train_all
-from benchmarks.grid.results import Result
 from benchmarks.grid.run import Run, make_run, suite_methods
-from benchmarks.report.figures import plot_learning_curves
-from benchmarks.report.markdown import markdown_table
-from benchmarks.report.task_tables import cost_table, mean_rows, returns_header, returns_rows
+from benchmarks.report.comparison import write_comparison
 
 # The suites whose algorithms have the argument, and the environments that are trained in by default
 ENVIRONMENTS = {"gym_control": ["Continual/Acrobot-v1", "Continual/LunarLander-v3"], "minatar": ["Continual/MinAtar-v0"]}
@@ -48,26 +44,17 @@ def variant_run(suite: str, name: str, env_id: str, seed: int, n_tasks: int, ste
     return replace(run, variant=name, overrides=OVERRIDES[name])
 
 
-def write_report(results: Sequence[Result]) -> None:
-    """
-    Write ``table.md`` and ``curves.png`` beside the runs, and print the table.
-
-    :param results: All runs in one environment
-    """
-    rows = [*returns_rows(results, LINES), *mean_rows(results, LINES)]
-    tables = f"{markdown_table(returns_header(results[0].task_names), rows)}\n\n{cost_table(results, LINES)}"
-    folder = results[0].path.parents[1]
-    (folder / "table.md").write_text(tables + "\n")
-    plot_learning_curves(results, folder / "curves.png", LINES, results[0].env_id)
-    print(f"{tables}\n\nWritten: {folder}/table.md, {folder}/curves.png")
-
-
 def main() -> None:
     """Parse the command line, train, write and print the tables and the curves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", default="gym_control", choices=list(ENVIRONMENTS), help="Suite of the environments")
     parser.add_argument("--env", nargs="+", help="Environment ids")
-    add_variant_arguments(parser, LINES, seeds=[0, 1, 2, 3], n_tasks=4, steps_per_task=64_000)
+    parser.add_argument("--variants", nargs="+", default=list(LINES), choices=list(LINES), help="What is compared")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3], help="Seeds of agents and of the offsets")
+    parser.add_argument("--n-tasks", type=int, default=4, help="Length of the task sequence")
+    parser.add_argument("--steps-per-task", type=int, default=64_000, help="Environment steps per task")
+    parser.add_argument("--jobs", type=int, default=2, help="Processes at a time")
+    parser.add_argument("--output", type=Path, default=Path("logs"), help="Folder of the results and logs")
     args = parser.parse_args()
     env_ids = args.env or ENVIRONMENTS[args.suite]
 
@@ -82,7 +69,7 @@ def main() -> None:
         parser.error(str(error))
     results = train_all(runs, args.output, args.jobs)
     for env_id in env_ids:
-        write_report([result for result in results if result.env_id == env_id])
+        write_comparison([result for result in results if result.env_id == env_id], LINES)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,13 @@ Vanilla, C-CHAIN, L2 Init and weight clipping. Tasks that are done are not learn
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
 
-from benchmarks.grid.run import ROOT
+from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.speed.tables import write_tables
 from benchmarks.supervised.images import Images, load_images
 from benchmarks.supervised.learner import METHODS, OPTIMIZERS, Settings
@@ -84,9 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--clip-ratio", type=float, default=defaults.clip_ratio, help="κ of weight clipping, by default %(default)g")
     add("--dry-run", action="store_true", help="List the runs and how long they take, and stop")
     add("--write", action="store_true", help="Train nothing; put tables and picture into the documentation")
-    add("--results", type=Path, default=ROOT / "benchmarks/results/supervised", help="Folder of the results")
-    add("--logs", type=Path, default=ROOT / "logs/supervised", help="Folder of what runs go on from")
-    add("--docs", type=Path, default=ROOT / "docs", help="Folder of the documentation")
+    add_folder_arguments(parser, "benchmarks/results/supervised", "logs/supervised")
     return parser
 
 
