@@ -174,17 +174,16 @@ def ended_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def stop_all(trainings: Sequence[Training], seconds: float = SECONDS_TO_STOP) -> None:
+def stop_all(trainings: Sequence[Training]) -> None:
     """
     Have trainings save themselves and end. Those that take too long are killed, and all of them when this is interrupted.
 
     :param trainings: Trainings
-    :param seconds: How long they may take
     """
     try:
         for training in trainings:
             training.stop()
-        end = time.monotonic() + seconds
+        end = time.monotonic() + SECONDS_TO_STOP
         while any(training.is_running() for training in trainings) and time.monotonic() < end:
             time.sleep(0.1)
     finally:

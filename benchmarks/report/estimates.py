@@ -59,20 +59,18 @@ def mean_and_error(scores: Sequence[float]) -> tuple[float, float | None]:
     return float(np.mean(scores)), error
 
 
-def bootstrap_interval(scores: Sequence[float], n_resamples: int = 10_000, level: float = 0.95) -> Interval | None:
+def bootstrap_interval(scores: Sequence[float]) -> Interval | None:
     """
-    Percentile bootstrap of the mean. With three seeds or fewer it reaches from the lowest to the highest, because
-    each of these alone makes up more than 2.5 % of the resamples.
+    95 % percentile bootstrap of the mean, of resamples that are always the same. With three seeds or fewer it reaches from the
+    lowest to the highest, because each of these alone makes up more than 2.5 % of the resamples.
 
     :param scores: One score per seed
-    :param n_resamples: Resamples, always the same ones
-    :param level: Share of the resamples' means that lies in the interval
     :return: Its ends, None for a single seed
     """
     if len(scores) < 2:
         return None
-    means = np.random.default_rng(0).choice(scores, (n_resamples, len(scores))).mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    means = np.random.default_rng(0).choice(scores, (10_000, len(scores))).mean(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
 
 

@@ -53,13 +53,13 @@ class Table:
         return {method: figure.mean for (name, method), figure in self.figures.items() if name == env_id}
 
 
-def read_tables(path: Path = TABLES) -> dict[str, Table]:
+def read_tables() -> dict[str, Table]:
     """
-    :param path: CSV file, whose first lines, which begin with ``#``, name its source
     :return: The tables by suite
     """
     tables: dict[str, Table] = {}
-    with open(path, newline="") as file:
+    with open(TABLES, newline="") as file:
+        # The first lines name the source
         for row in csv.DictReader(line for line in file if not line.startswith("#")):
             table = tables.setdefault(row["suite"], Table({}, {}, int(row["seeds"] or 0)))
             standard_error = float(row["standard_error"] or "nan")

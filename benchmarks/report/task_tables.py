@@ -35,17 +35,16 @@ def returns_rows(results: Sequence[Result], lines: Mapping[str, Method], digits:
     ]
 
 
-def mean_rows(results: Sequence[Result], lines: Mapping[str, Method], digits: int = 1) -> list[list[str]]:
+def mean_rows(results: Sequence[Result], lines: Mapping[str, Method]) -> list[list[str]]:
     """
     :param results: Runs in one environment, of one length
     :param lines: Label of each method or variant, in their order
-    :param digits: Digits after the point
     :return: Rows like those of :func:`returns_rows`, in bold: for each method the mean over its seeds
     """
     rows = []
     for name in dict.fromkeys(result.line for result in in_order(results, lines)):
         averages = np.mean([result.task_averages() for result in results if result.line == name], axis=0)
-        rows.append([f"**{cell}**" for cell in (lines[name].label, "mean", *average_cells(averages, digits))])
+        rows.append([f"**{cell}**" for cell in (lines[name].label, "mean", *average_cells(averages))])
     return rows
 
 

@@ -244,11 +244,10 @@ def _save(run: Run, images: Images, learner: Learner, progress: Progress) -> Non
         writer.writerows((index, f"{accuracy:.6f}") for index, accuracy in enumerate(progress.accuracies))
 
 
-def updates_per_second(run: Run, images: Images, seconds: float = 0.5) -> float:
+def updates_per_second(run: Run, images: Images) -> float:
     """
     :param run: A run
     :param images: The images
-    :param seconds: How long to try at least
     :return: How many of its updates this machine makes in a second now
     """
     th.set_num_threads(1)
@@ -256,7 +255,7 @@ def updates_per_second(run: Run, images: Images, seconds: float = 0.5) -> float:
     task, generator = make_task(run.problem, images, 10 * BATCH_SIZE, run.seed, 0)
     learner.learn(task, 1, generator)
     n_updates, started = 0, time.perf_counter()
-    while time.perf_counter() < started + seconds:
+    while time.perf_counter() < started + 0.5:
         learner.learn(task, 1, generator)
         n_updates += 10
     return n_updates / (time.perf_counter() - started)

@@ -96,18 +96,15 @@ class TrainingCheckpoint(BaseCallback):
         self._replaced_handlers: dict[int, Any] = {}
 
     @classmethod
-    def resume_from(
-        cls, checkpoint: Checkpoint, path: str | Path | None = None, save_freq: int | None = None
-    ) -> "TrainingCheckpoint":
+    def resume_from(cls, checkpoint: Checkpoint, path: str | Path | None = None) -> "TrainingCheckpoint":
         """
         :param checkpoint: A checkpoint
         :param path: Folder of the further checkpoints, by default the one that it is in
-        :param save_freq: Environment steps between them, by default as before
         :return: A callback with the former settings that goes on from the checkpoint, see :meth:`go_on_from`
         """
         settings = checkpoint.info["training_checkpoint"]
         path = checkpoint.folder if path is None else path
-        callback = cls(save_freq or settings["save_freq"], path, settings["keep"], settings["exact"])
+        callback = cls(settings["save_freq"], path, settings["keep"], settings["exact"])
         callback.go_on_from(checkpoint)
         return callback
 

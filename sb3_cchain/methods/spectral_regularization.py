@@ -47,10 +47,10 @@ class SpectralRegularization(Penalty):
         self.power = power
         super().__init__(params, lr, coef=coef, **kwargs)
 
-    def _singular(self, n_iterations: int = 1) -> list[tuple[th.Tensor, th.Tensor, th.Tensor]]:
+    def _singular(self) -> list[tuple[th.Tensor, th.Tensor, th.Tensor]]:
         """Of each weight matrix the greatest singular value, its left and its right vector."""
         matrices = [weight.flatten(start_dim=1) for weight in self.weights()]
-        known = self.own_state.get("vectors", [])
+        known, n_iterations = self.own_state.get("vectors", []), 1
         if len(known) < len(matrices):
             n_iterations = 15
             # Always the same numbers, so that training draws those that it would have drawn
