@@ -12,36 +12,11 @@ from sb3_cchain.networks.activations import CReLU, FourierFeatures
 from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 
 
-def hidden_layers(
-    n_inputs: int,
-    net_arch: list[int],
-    activation_fn: type[nn.Module],
-    layer_norm: bool,
-    linear: type[nn.Linear] = nn.Linear,
-) -> tuple[list[nn.Module], int]:
-    """
-    Linear layers, each followed by a LayerNorm (on request) and the activation.
-
-    :param n_inputs: Number of inputs
-    :param net_arch: Units of each layer
-    :param activation_fn: Makes the activation; with :class:`CReLU` and
-        :class:`FourierFeatures` a layer has twice as many outputs as units
-    :param layer_norm: Whether there is a LayerNorm before each activation
-    :param linear: Makes the linear layers
-    :return: The modules, and the number of outputs of the last one
-    """
-    modules: list[nn.Module] = []
-    for n_units in net_arch:
-        modules.append(linear(n_inputs, n_units))
-        if layer_norm:
-            modules.append(nn.LayerNorm(n_units))
-        modules.append(activation_fn())
-        n_inputs = n_units * getattr(modules[-1], "expansion", 1)
-    return modules, n_inputs
-
-
 class _Hidden:
-    """What the variants of SB3's policies have in common: how they make the hidden layers of a network."""
+    """
+    What the variants of SB3's policies have in common: linear layers, each followed by a LayerNorm (on request) and the
+    activation, which may have several outputs for each unit, as :class:`CReLU` has.
+    """
 
     layer_norm: ClassVar[bool] = False
     linear: ClassVar[type[nn.Linear]] = nn.Linear
@@ -49,8 +24,14 @@ class _Hidden:
 
     def _make_hidden(self, n_inputs: int, net_arch: list[int]) -> tuple[nn.Sequential, int]:
         """The hidden layers, and the number of their outputs."""
-        modules, n_outputs = hidden_layers(n_inputs, net_arch, self.activation_fn, self.layer_norm, self.linear)
-        return nn.Sequential(*modules), n_outputs
+        modules: list[nn.Module] = []
+        for n_units in net_arch:
+            modules.append(self.linear(n_inputs, n_units))
+            if self.layer_norm:
+                modules.append(nn.LayerNorm(n_units))
+            modules.append(self.activation_fn())
+            n_inputs = n_units * getattr(modules[-1], "expansion", 1)
+        return nn.Sequential(*modules), n_inputs
 
 
 class ActorCriticVariant(_Hidden, ActorCriticPolicy):
