@@ -11,7 +11,7 @@ import torch as th
 from sb3_cchain.algorithms.churn_log import churn_prefix, log_churn
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.recorded import recorded
-from sb3_cchain.algorithms.replay_observations import sample_observations, sample_with_actions
+from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducer, extra_gradient
 from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.networks.compiled import uncompiled
@@ -64,8 +64,8 @@ def reduced_off_policy(model: Any, reducers: Mapping[str, ChurnReducer]) -> Iter
 
 def _hold_still(model: Any, target: ChurnTarget, reducer: ChurnReducer, changes: list[float]) -> None:
     """Right after ``zero_grad()``."""
-    sample = sample_with_actions if target.needs else sample_observations
-    reference = sample(model.replay_buffer, model.batch_size, model._vec_normalize_env)
+    with_actions = bool(target.needs)
+    reference = sample_observations(model.replay_buffer, model.batch_size, model._vec_normalize_env, with_actions)
     policy = uncompiled(model.policy)
     network = getattr(policy, target.optimizer) if target.optimizer else policy
     old: th.Tensor | None = reducer.old_outputs
