@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, find_outputs, model_outputs
+from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, known_kind, model_outputs
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
@@ -94,7 +94,7 @@ class ChurnMonitor(BaseCallback):
         self._observations: deque[NDArray[Any]] = deque()
 
     def _init_callback(self) -> None:
-        find_outputs(self.model)
+        known_kind(self.model)  # raises for an algorithm that is not known
 
     def _on_training_start(self) -> None:
         self._hooks.begin(self.model)

@@ -4,7 +4,6 @@ import math
 import warnings
 
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.findings import CHECKS, Finding, diagnose
@@ -73,10 +72,6 @@ class Doctor(TrainingInterval):
         # Before train(): the batch, the outputs, and the standard deviation of actions
         self._before: tuple[Batch, ModelOutputs, th.Tensor | None] | None = None
         self._hooks = TrainingHooks()
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
-            raise TypeError(f"Doctor is for on-policy and off-policy algorithms, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()

@@ -1,8 +1,6 @@
 """The outputs of any Stable-Baselines3 model, and how far they moved."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch as th
@@ -46,9 +44,9 @@ def model_outputs(model: BaseAlgorithm, batch: Batch) -> ModelOutputs:
     :return: Its outputs, in evaluation mode
     :raises TypeError: For an algorithm that is not known here
     """
-    outputs = find_outputs(model)
+    kind = known_kind(model)
     with th.no_grad(), evaluation_mode(model.policy):
-        return outputs(model.policy, batch)
+        return _outputs_of_kind(kind, model.policy, batch)
 
 
 def churn(old: ModelOutputs, new: ModelOutputs) -> dict[str, float]:
@@ -77,16 +75,16 @@ def churn(old: ModelOutputs, new: ModelOutputs) -> dict[str, float]:
     return churns
 
 
-def find_outputs(model: BaseAlgorithm) -> Callable[[Any, Batch], ModelOutputs]:
+def known_kind(model: BaseAlgorithm) -> PolicyKind:
     """
     :param model: A model
-    :return: Maps its policy and a batch to the outputs
+    :return: The kind of its policy
     :raises TypeError: For an algorithm that is not known here
     """
     kind = policy_kind(model.policy)
     if kind is None:
         raise TypeError(f"The outputs of {type(model).__name__} with {type(model.policy).__name__} are not known")
-    return partial(_outputs_of_kind, kind)
+    return kind
 
 
 def _outputs_of_kind(kind: PolicyKind, policy: Any, batch: Batch) -> ModelOutputs:

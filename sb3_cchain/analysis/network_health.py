@@ -1,8 +1,6 @@
 """Logs how healthy a model's networks are while it learns."""
 
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.health_figures import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
@@ -62,10 +60,6 @@ class NetworkHealth(TrainingInterval):
         self.batch_size = batch_size
         self.tau = tau
         self._hooks = TrainingHooks()
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
-            raise TypeError(f"NetworkHealth is for on-policy and off-policy algorithms, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()

@@ -32,6 +32,11 @@ class TrainingInterval(BaseCallback):
         # Goes on when `learn()` is called again
         self._has_looked = False
 
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
+            name, algorithm = type(self).__name__, type(self.model).__name__
+            raise TypeError(f"{name} is for on-policy and off-policy algorithms, got {algorithm}")
+
     def _on_training_start(self) -> None:
         add_overview(self.model)
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
