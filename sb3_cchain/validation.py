@@ -1,8 +1,10 @@
 """Checks of arguments, with errors that name the argument, its value and what is allowed."""
 
 import math
+import os
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,3 +85,15 @@ def check_list(name: str, value: Any, of: str) -> list[Any]:
         return list(value)
     except TypeError:
         raise TypeError(f"`{name}` must be a list of {of}, got {value!r}") from None
+
+
+def check_path(name: str, value: object) -> Path:
+    """
+    :param name: The argument's name
+    :param value: Its value
+    :return: The path
+    :raises TypeError: When it is no path
+    """
+    if not isinstance(value, (str, os.PathLike)):
+        raise TypeError(f"`{name}` must be a path, got {value!r}")
+    return Path(value)

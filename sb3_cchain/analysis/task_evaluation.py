@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,7 +26,7 @@ from sb3_cchain.tasks.evaluation import check_same_tasks
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
-from sb3_cchain.validation import check_bool, check_number
+from sb3_cchain.validation import check_bool, check_number, check_path
 
 # Steps of an episode after which a warning says that it may never end
 LONG_EPISODE = 100_000
@@ -60,14 +59,12 @@ class TaskEvaluation(BaseCallback):
             check_number("interval", interval, 1, integer=True)
         check_bool("deterministic", deterministic)
         check_number("seed", seed, 0, integer=True)
-        if path is not None and not isinstance(path, (str, PathLike)):
-            raise TypeError(f"`path` must be a path, got {path!r}")
         self.eval_env: Any = eval_env  # vectorised, once there is a model
         self.n_eval_episodes = n_eval_episodes
         self.interval = interval
         self.deterministic = deterministic
         self.seed = seed
-        self.path: Path | None = None if path is None else Path(path)
+        self.path: Path | None = None if path is None else check_path("path", path)
         self._file: ReturnsFile | None = None
         self._last_step = 0
         # Of the last rollout, whose task is evaluated when training ends

@@ -3,7 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from sb3_cchain.tasks.signal import (
     step_task,
 )
 from sb3_cchain.tensorboard.overview import add_overview
+from sb3_cchain.validation import check_path
 
 
 class ContinualMetrics(BaseCallback):
@@ -70,9 +70,7 @@ class ContinualMetrics(BaseCallback):
 
     def __init__(self, path: str | Path | None = None):
         super().__init__()
-        if path is not None and not isinstance(path, (str, PathLike)):
-            raise TypeError(f"`path` must be a path, got {path!r}")
-        self.path = None if path is None else Path(path)
+        self.path = None if path is None else check_path("path", path)
         self._finished: dict[int, list[float]] = defaultdict(list)
         self._endless: dict[int, float] = {}
         self._file: ReturnsFile | None = None

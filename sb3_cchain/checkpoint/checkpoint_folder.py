@@ -22,8 +22,9 @@ import numpy as np
 import torch as th
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
-from sb3_cchain.checkpoint.files import check_path, check_writable, sync_folder, write_safely
+from sb3_cchain.checkpoint.files import check_writable, sync_folder, write_safely
 from sb3_cchain.locked_file import open_locked
+from sb3_cchain.validation import check_path
 
 # Of the files. A later version of the package reads it, or says that it does not
 FORMAT = 3

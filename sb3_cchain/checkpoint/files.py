@@ -134,18 +134,6 @@ def load_statistics(normalize: VecNormalize, path: str | Path) -> None:
             setattr(normalize, name, vars(saved)[name])
 
 
-def check_path(name: str, value: object) -> Path:
-    """
-    :param name: The argument's name
-    :param value: Its value
-    :return: The path
-    :raises TypeError: When it is no path
-    """
-    if not isinstance(value, (str, os.PathLike)):
-        raise TypeError(f"`{name}` must be a path, got {value!r}")
-    return Path(value)
-
-
 def check_writable(folder: Path) -> None:
     """
     Make a folder, and write to it.

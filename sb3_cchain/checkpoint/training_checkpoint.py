@@ -20,14 +20,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, has_checkpoint, package_versions
 from sb3_cchain.checkpoint.environment_processes import live_as_long_as_training
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
-from sb3_cchain.checkpoint.files import check_path, sync_files
+from sb3_cchain.checkpoint.files import sync_files
 from sb3_cchain.checkpoint.log import describe_log
 from sb3_cchain.checkpoint.new_episodes import begin_new_episodes, lasting_state
 from sb3_cchain.checkpoint.object_state import find_named, name_in_module
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
 from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
 from sb3_cchain.tasks.callback_tree import require_single
-from sb3_cchain.validation import check_bool, check_number
+from sb3_cchain.validation import check_bool, check_number, check_path
 
 DIFFERENT = "Make the training as it was, or load the model as usual, which begins new episodes."
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

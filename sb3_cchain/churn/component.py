@@ -6,6 +6,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_cchain.validation import check_choice
+
 COMPONENTS = ("full", "projection", "orthogonal")
 
 
@@ -20,8 +22,7 @@ def gradient_component(churn: Sequence[th.Tensor], base: Sequence[th.Tensor], co
     :return: The component, a tensor for each parameter
     :raises ValueError: For any other component, and when the gradients are not of the same parameters
     """
-    if component not in COMPONENTS:
-        raise ValueError(f"`component` must be one of {', '.join(map(repr, COMPONENTS))}, got {component!r}")
+    check_choice("component", component, COMPONENTS)
     shapes = [[tuple(gradient.shape) for gradient in gradients] for gradients in (churn, base)]
     if shapes[0] != shapes[1] or not shapes[0]:
         raise ValueError(f"`churn` and `base` must hold a gradient of each parameter, got shapes {shapes[0]} and {shapes[1]}")

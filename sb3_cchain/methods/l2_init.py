@@ -7,7 +7,7 @@ from torch.optim.optimizer import ParamsT
 
 from sb3_cchain.methods.penalty import Penalty
 from sb3_cchain.tensorboard.layout import add_charts
-from sb3_cchain.validation import check_bool
+from sb3_cchain.validation import check_bool, check_choice
 
 add_charts(
     "Related methods",
@@ -67,10 +67,8 @@ class L2Init(Penalty):
         exclude_norms: bool = False,
         **kwargs: Any,
     ):
-        if towards not in ("init", "zero"):
-            raise ValueError(f'`towards` must be "init" or "zero", got {towards!r}')
-        if reduction not in ("sum", "mean"):
-            raise ValueError(f'`reduction` must be "sum" or "mean", got {reduction!r}')
+        check_choice("towards", towards, ("init", "zero"))
+        check_choice("reduction", reduction, ("sum", "mean"))
         check_bool("exclude_norms", exclude_norms)
         self.towards = towards
         self.reduction = reduction
