@@ -36,17 +36,11 @@ class TaskVecNormalize(VecNormalize):
     (:class:`~sb3_cchain.TaskSync` does so) and restart otherwise.
 
     :param venv: The vectorised environment
-    :param training: See ``VecNormalize``, as the following ones
-    :param norm_obs: Whether to normalise observations
-    :param norm_reward: Whether to normalise rewards
-    :param clip_obs: Greatest absolute value of a normalised observation
-    :param clip_reward: Greatest absolute value of a normalised reward
-    :param gamma: Discount factor of the returns whose variance scales the rewards
-    :param epsilon: Added to variances
-    :param norm_obs_keys: The parts of a ``Dict`` observation to normalise
+    :param args: Further arguments of ``VecNormalize``
     :param restart: Whether the statistics restart at a switch
     :param returns_over_cuts: Whether the discounted return that scales the rewards goes on over an episode that is cut, by a
         limit of time, into the next one, as in Gymnasium's ``NormalizeReward``. It starts over at a switch in any case
+    :param kwargs: Further keyword arguments of ``VecNormalize``
     :raises TypeError: When ``training``, ``norm_obs``, ``norm_reward``, ``restart`` or ``returns_over_cuts`` is not a boolean
     """
 
@@ -55,27 +49,12 @@ class TaskVecNormalize(VecNormalize):
 
     venv: VecEnv
 
-    def __init__(
-        self,
-        venv: VecEnv,
-        training: bool = True,
-        norm_obs: bool = True,
-        norm_reward: bool = True,
-        clip_obs: float = 10.0,
-        clip_reward: float = 10.0,
-        gamma: float = 0.99,
-        epsilon: float = 1e-8,
-        norm_obs_keys: list[str] | None = None,
-        *,
-        restart: bool = True,
-        returns_over_cuts: bool = False,
-    ):
-        flags = {"training": training, "norm_obs": norm_obs, "norm_reward": norm_reward, "restart": restart}
-        for name, flag in (flags | {"returns_over_cuts": returns_over_cuts}).items():
-            check_bool(name, flag)
-        super().__init__(venv, training, norm_obs, norm_reward, clip_obs, clip_reward, gamma, epsilon, norm_obs_keys)
+    def __init__(self, venv: VecEnv, *args: Any, restart: bool = True, returns_over_cuts: bool = False, **kwargs: Any):
+        super().__init__(venv, *args, **kwargs)
         self.restart = restart
         self.returns_over_cuts = returns_over_cuts
+        for name in ("training", "norm_obs", "norm_reward", "restart", "returns_over_cuts"):
+            check_bool(name, getattr(self, name))
         # Of no task before the first step, and where tasks have no number
         self._switch = TaskSwitch()
         # The same by the word of a TaskSignal, which may number tasks otherwise
