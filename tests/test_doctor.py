@@ -23,7 +23,7 @@ from sb3_cchain.algorithms.contrib import CChainTQC
 from sb3_cchain.analysis import Doctor, remedies
 from sb3_cchain.analysis import doctor as doctor_module
 from sb3_cchain.analysis import symptoms as symptoms_module
-from sb3_cchain.analysis.findings import BY_NAME, CHECKS, diagnose, findings_markdown
+from sb3_cchain.analysis.findings import BY_NAME, CHECKS, diagnose
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.analysis.model_outputs import ModelOutputs
 from sb3_cchain.analysis.remedies import Remedy
@@ -42,7 +42,6 @@ from sb3_cchain.methods.registry import METHOD_NAMES
 from sb3_cchain.networks import CReLUPolicy, LayerNormDQNPolicy, LayerNormPolicy
 from tests.envs import CountEnv, RandomEnv
 from tests.resume_cases import Stop, Stopped
-from tests.test_docs import ROOT
 
 NET = dict(net_arch=[16])
 BOX_ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -575,11 +574,6 @@ def test_the_page_needs_nothing_beside_it():
     assert page.count("<img") == page.count("<img alt=") == 1
     assert "Findings: 4 likely" in page and "from sb3_cchain.methods import ReDo" in page
     assert "looks healthy" in html_report([healthy(PPO)], "title", with_picture=False)
-
-
-def test_the_documentation_has_the_table_of_the_code():
-    page = (ROOT / "docs" / "modules" / "doctor.md").read_text()
-    assert findings_markdown() in page, "python -m benchmarks.doctor --write"
 
 
 def test_patience_and_size_of_the_batch(monkeypatch):

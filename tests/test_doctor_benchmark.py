@@ -8,8 +8,17 @@ from stable_baselines3 import PPO
 from benchmarks.doctor import __main__ as command
 from benchmarks.doctor import cases, results, training
 from benchmarks.doctor.cases import CASES, CHOSEN_ON, HELD_OUT, Case
-from benchmarks.doctor.results import Examination, confusion_table, models_table, read, write, wrong_table
+from benchmarks.doctor.results import (
+    Examination,
+    confusion_table,
+    findings_table,
+    models_table,
+    read,
+    write,
+    wrong_table,
+)
 from benchmarks.doctor.training import Patient, patients
+from benchmarks.grid.run import ROOT
 from sb3_cchain.analysis.findings import BY_NAME, CHECKS
 
 TINY = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
@@ -98,3 +107,8 @@ def test_models_are_of_their_ages(small, tmp_path):
     for patient in (Patient("healthy", 16, tmp_path), Patient("healthy", 32, tmp_path)):
         assert PPO.load(patient.path).num_timesteps == patient.steps
     assert Patient("healthy", 32, tmp_path).make_env(0).obs_rms.count > 32
+
+
+def test_the_documentation_has_the_table_of_the_code():
+    page = (ROOT / "docs" / "modules" / "doctor.md").read_text()
+    assert findings_table() in page, "python -m benchmarks.doctor --write"

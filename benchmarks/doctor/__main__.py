@@ -15,12 +15,11 @@ from pathlib import Path
 import torch as th
 
 from benchmarks.doctor.cases import CASES
-from benchmarks.doctor.results import confusion_table, examine, models_table, read, write, wrong_table
+from benchmarks.doctor.results import confusion_table, examine, findings_table, models_table, read, write, wrong_table
 from benchmarks.doctor.training import patients, train_missing
 from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.run import ROOT
 from benchmarks.speed.tables import write_tables
-from sb3_cchain.analysis.findings import findings_markdown
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -59,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     print(*tables.values(), sep="\n\n")
     if args.write:
-        write_tables({"doctor_findings": findings_markdown(), **tables}, args.docs)
+        write_tables({"doctor_findings": findings_table(), **tables}, args.docs)
 
 
 if __name__ == "__main__":

@@ -5,12 +5,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.doctor.training import Patient
 from benchmarks.report.markdown import markdown_table
+from benchmarks.speed.tables import LINE_LENGTH
 from sb3_cchain.analysis.findings import CHECKS, Check
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.checkpoint.files import write_safely
@@ -186,3 +188,20 @@ def models_table(examinations: Sequence[Examination]) -> str:
             about = f"{case.algorithm.__name__}, {case.env}"
             rows.append([about, case.cause, where, ", ".join([*found, *missed]) or "nothing"])
     return markdown_table(["model", "what is wrong", "set", "found"], rows)
+
+
+def findings_table() -> str:
+    """
+    :return: All findings: a table, and a list of what they mean
+    """
+    header = ["finding", "what is wrong", "measure", "healthy", "certainty"]
+    rows = [
+        [f"`{check.name}`", check.title, check.measure.replace("_", " "), check.healthy_range(), check.certainty]
+        for check in CHECKS
+    ]
+    items = []
+    for check in CHECKS:
+        remedies = "; ".join(dict.fromkeys(remedy.title for remedy in check.remedies))
+        text = f"- `{check.name}`: {check.meaning} *Threshold*: {check.source}. *Try* {remedies}."
+        items.append(fill(text, LINE_LENGTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False))
+    return "\n\n".join([markdown_table(header, rows), "\n".join(items)])

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from textwrap import fill
 from typing import Any, Literal, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -263,22 +262,3 @@ def as_json(value: Any) -> Any:
     :return: It, or None where JSON has no such number
     """
     return value if math.isfinite(value) else None
-
-
-def findings_markdown(width: int = 120) -> str:
-    """
-    :param width: Length of its lines, but for those of the table
-    :return: All findings for the documentation: a table, and a list of what they mean
-    """
-    header = [["finding", "what is wrong", "measure", "healthy", "certainty"], ["---"] * 5]
-    rows = [
-        [f"`{check.name}`", check.title, check.measure.replace("_", " "), check.healthy_range(), check.certainty]
-        for check in CHECKS
-    ]
-    table = "\n".join(f"| {' | '.join(cells)} |" for cells in [*header, *rows])
-    items = []
-    for check in CHECKS:
-        remedies = "; ".join(dict.fromkeys(remedy.title for remedy in check.remedies))
-        text = f"- `{check.name}`: {check.meaning} *Threshold*: {check.source}. *Try* {remedies}."
-        items.append(fill(text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False))
-    return "\n\n".join([table, "\n".join(items)])
