@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.doctor.cases import CASES, CHOSEN_ON, Case
-from sb3_cchain.checkpoint.files import save_model, write_safely
+from sb3_cchain.checkpoint.files import save_model, save_statistics
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,7 @@ class SaveAtAges(BaseCallback):
             self._save(patient)
 
     def _save(self, patient: Patient) -> None:
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is not None:
-            with write_safely(patient.statistics) as path:
-                normalize.save(str(path))
+        save_statistics(self.model, patient.statistics)
         save_model(self.model, patient.path)
 
 

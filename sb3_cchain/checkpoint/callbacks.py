@@ -4,7 +4,7 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
-from sb3_cchain.checkpoint.files import save_model, write_safely
+from sb3_cchain.checkpoint.files import save_model, save_statistics, write_safely
 
 
 class SafeCheckpointCallback(CheckpointCallback):
@@ -19,10 +19,8 @@ class SafeCheckpointCallback(CheckpointCallback):
             if self.save_replay_buffer and getattr(self.model, "replay_buffer", None) is not None:
                 with write_safely(self._checkpoint_path("replay_buffer_", "pkl")) as path:
                     self.model.save_replay_buffer(path)  # type: ignore[attr-defined]
-            normalize = self.model.get_vec_normalize_env()
-            if self.save_vecnormalize and normalize is not None:
-                with write_safely(self._checkpoint_path("vecnormalize_", "pkl")) as path:
-                    normalize.save(str(path))
+            if self.save_vecnormalize:
+                save_statistics(self.model, self._checkpoint_path("vecnormalize_", "pkl"))
             model_path = self._checkpoint_path(extension="zip")
             save_model(self.model, model_path)
             if self.verbose >= 2:
@@ -45,9 +43,6 @@ class SaveBestModel(BaseCallback):
         self.statistics_path = statistics_path
 
     def _on_step(self) -> bool:
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is not None:
-            with write_safely(self.statistics_path) as path:
-                normalize.save(str(path))
+        save_statistics(self.model, self.statistics_path)
         save_model(self.model, self.path)
         return True

@@ -75,6 +75,19 @@ def save_model(model: BaseAlgorithm, path: str | Path) -> None:
         model.save(unfinished)
 
 
+def save_statistics(model: BaseAlgorithm, path: str | Path) -> None:
+    """
+    Save the ``VecNormalize`` of a model's environment, if there is one, by :func:`write_safely`.
+
+    :param model: A model
+    :param path: The pickle file
+    """
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None:
+        with write_safely(path) as unfinished:
+            normalize.save(str(unfinished))
+
+
 def check_model_file(path: str | Path) -> None:
     """
     :param path: A saved model

@@ -31,6 +31,7 @@ from sb3_cchain.checkpoint import (
     write_safely,
 )
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint
+from sb3_cchain.checkpoint.files import save_statistics
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize
@@ -291,10 +292,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         :raises SystemExit: With checkpoints, when training was interrupted by Ctrl-C
         """
         print(f"Saving to {self.save_path}")
-        normalize = model.get_vec_normalize_env()
-        if normalize is not None:
-            with write_safely(f"{self.params_path}/vecnormalize.pkl") as path:
-                normalize.save(str(path))
+        save_statistics(model, f"{self.params_path}/vecnormalize.pkl")
         if isinstance(model, OffPolicyAlgorithm) and self.save_replay_buffer:
             print("Saving replay buffer")
             with write_safely(f"{self.save_path}/replay_buffer.pkl") as path:
