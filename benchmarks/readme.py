@@ -16,8 +16,8 @@ from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cell, Cells, make_cells
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
+from benchmarks.report.places import write_tables
 from benchmarks.report.tables import method_label
-from benchmarks.speed.tables import write_tables
 from sb3_cchain.analysis.curves import smoothed
 from sb3_cchain.analysis.plots import import_matplotlib
 

@@ -17,8 +17,8 @@ from benchmarks.grid.plan import SHELF_SUITES, shelf_runs
 from benchmarks.grid.results import Result, find_result
 from benchmarks.grid.run import Run, short_name, suite_methods
 from benchmarks.report.markdown import markdown_table
+from benchmarks.report.places import PLACE, write_tables
 from benchmarks.report.task_tables import MISSING
-from benchmarks.speed.tables import PLACE, write_tables
 from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.methods.registry import Method
 

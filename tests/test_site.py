@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from benchmarks.readme import read_cells, readme_table
-from benchmarks.speed.tables import PLACE
+from benchmarks.report.places import PLACE
 from tests.test_docs import ALL_PAGES, ROOT, name_of, without_code
 
 DOCS = ROOT / "docs"

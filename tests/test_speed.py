@@ -16,12 +16,13 @@ from torch import nn
 from benchmarks.family import cases as family
 from benchmarks.grid.run import ROOT
 from benchmarks.grid.suites import SUITES
+from benchmarks.report.places import PLACE, write_tables
 from benchmarks.sensitivity.runs import PARAMETERS
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import big_rollout, cases, gpu, memory, sbx_ppo
 from benchmarks.speed.checkpoint_cost import measure_share
 from benchmarks.speed.settings import model_settings
-from benchmarks.speed.tables import PLACE, Table, write_tables
+from benchmarks.speed.tables import Table
 from benchmarks.speed.timing import TRAIN, Case, Entry, Product, n_operations, time_case
 from benchmarks.speed.update_parts import PARTS, REFERENCE, dqn_parts, parts_of_an_update, ppo_parts, watched
 from benchmarks.supervised.tasks import PROBLEMS

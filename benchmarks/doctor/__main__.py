@@ -19,7 +19,7 @@ from benchmarks.doctor.results import confusion_table, examine, findings_table, 
 from benchmarks.doctor.training import patients, train_missing
 from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.run import ROOT
-from benchmarks.speed.tables import write_tables
+from benchmarks.report.places import write_tables
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.doctor.training import Patient
 from benchmarks.report.markdown import markdown_table
-from benchmarks.speed.tables import LINE_LENGTH
+from benchmarks.report.places import LINE_LENGTH
 from sb3_cchain.analysis.findings import CHECKS, Check
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.checkpoint.files import write_safely

@@ -18,7 +18,7 @@ from benchmarks.family.picture import plot
 from benchmarks.family.tables import about, case_table, falls_table, read_all, summary_table
 from benchmarks.family.training import runs_of, train_all
 from benchmarks.grid.arguments import add_folder_arguments
-from benchmarks.speed.tables import write_tables
+from benchmarks.report.places import write_tables
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.family.case import Case
 from benchmarks.family.training import Run, read
 from benchmarks.report.markdown import markdown_table
-from benchmarks.speed.tables import LINE_LENGTH
+from benchmarks.report.places import LINE_LENGTH
 from sb3_cchain.analysis.metrics.intervals import difference_interval
 
 # Of the evaluations of each task, the last fifth is its end

@@ -23,8 +23,8 @@ from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.page import read_groups, section, table
 from benchmarks.plasticity.runs import COMPONENTS, default_names, watched_run
 from benchmarks.plasticity.snapshots import keep_snapshots
+from benchmarks.report.places import write_tables
 from benchmarks.run import list_grid
-from benchmarks.speed.tables import write_tables
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -17,12 +17,12 @@ from rich.console import Console
 from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS
+from benchmarks.report.places import write_tables
 from benchmarks.run import list_grid
 from benchmarks.sensitivity.costs import measure, read_costs
 from benchmarks.sensitivity.picture import plot
 from benchmarks.sensitivity.runs import ENVS, PARAMETERS, all_runs, read_scores
 from benchmarks.sensitivity.tables import cost_table, sensitivity_table
-from benchmarks.speed.tables import write_tables
 
 PICTURE = "images/sensitivity.png"
 COSTS = "sensitivity_costs.csv"

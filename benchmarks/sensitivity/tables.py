@@ -7,10 +7,10 @@ import numpy as np
 
 from benchmarks.grid.run import short_name
 from benchmarks.report.markdown import markdown_table
+from benchmarks.report.places import LINE_LENGTH
 from benchmarks.report.task_tables import MISSING
 from benchmarks.sensitivity.costs import BASE, Cost
 from benchmarks.sensitivity.runs import PARAMETERS, Scores
-from benchmarks.speed.tables import LINE_LENGTH
 
 
 def sensitivity_table(name: str, values: Scores, base: Scores, seeds: Sequence[int]) -> str:

@@ -17,12 +17,13 @@ from importlib.metadata import version
 import torch as th
 
 from benchmarks.grid.run import ROOT
+from benchmarks.report.places import write_tables
 from benchmarks.speed import sbx_ppo
 from benchmarks.speed.cases import CASES
 from benchmarks.speed.checkpoint_cost import checkpoint_table, share_table
 from benchmarks.speed.memory import memory_table
 from benchmarks.speed.monitor_cost import monitor_table
-from benchmarks.speed.tables import Table, write_tables
+from benchmarks.speed.tables import Table
 from benchmarks.speed.timing import time_case
 from benchmarks.speed.update_parts import dqn_parts, ppo_parts
 

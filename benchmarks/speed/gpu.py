@@ -18,9 +18,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.envs import FakeImageEnv
 
 from benchmarks.grid.run import ROOT
+from benchmarks.report.places import write_tables
 from benchmarks.speed.big_rollout import with_rollout
 from benchmarks.speed.settings import model_settings
-from benchmarks.speed.tables import Table, write_tables
+from benchmarks.speed.tables import Table
 from benchmarks.speed.timing import ratio
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 

@@ -17,7 +17,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from benchmarks.grid.arguments import add_folder_arguments
-from benchmarks.speed.tables import write_tables
+from benchmarks.report.places import write_tables
 from benchmarks.supervised.images import Images, load_images
 from benchmarks.supervised.learner import METHODS, OPTIMIZERS, Settings
 from benchmarks.supervised.picture import plot

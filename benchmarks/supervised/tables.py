@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.report.markdown import markdown_table
-from benchmarks.speed.tables import LINE_LENGTH
+from benchmarks.report.places import LINE_LENGTH
 from benchmarks.supervised.learner import BATCH_SIZE, METHODS
 from benchmarks.supervised.tasks import PROBLEMS
 from benchmarks.supervised.training import read_about, read_accuracies
