@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback, ConvertCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.__main__
@@ -300,3 +301,26 @@ def test_models_with_nothing_in_common():
     rows = dict(zip(*(list(column.cells) for column in distances.columns), strict=True))
     assert rows.pop("together") == ""
     assert set(rows.values()) == {"not of the same shape"}
+
+
+@pytest.mark.parametrize("algorithm", [PPO, DQN])
+def test_a_model_goes_on_with_its_own_settings_and_logger(algorithm, tmp_path):
+    model = make(algorithm).learn(64)
+    logger = configure(str(tmp_path), ["csv"])
+    model.set_logger(logger)
+    settings = {
+        name: vars(model).get(name) for name in ("train_freq", "gradient_steps", "learning_starts", "_stats_window_size")
+    }
+    episodes = list(model.ep_info_buffer)
+    inspect_model(model, n_steps=16, n_updates=2)
+    assert settings == {name: vars(model).get(name) for name in settings}
+    assert model.logger is logger and list(model.ep_info_buffer) == episodes
+    model.learn(64, log_interval=1, reset_num_timesteps=False)
+    assert "rollout/ep_rew_mean" in (tmp_path / "progress.csv").read_text()
+
+
+def test_a_model_that_has_not_been_trained_logs_as_ever(tmp_path):
+    model = PPO("MlpPolicy", "CartPole-v1", tensorboard_log=str(tmp_path), device="cpu", **OF_PPO)
+    inspect_model(model)
+    model.learn(64, reset_num_timesteps=False)
+    assert len(list(tmp_path.rglob("events.*"))) == 1

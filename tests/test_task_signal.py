@@ -648,3 +648,42 @@ def test_a_signal_is_kept_out_of_the_continual_environments_clock():
 
 def test_delta_reaches_the_detector():
     assert TaskSignal(drift="adwin", drift_delta=0.3)._detector.delta == 0.3
+
+
+def give_another_world(model):
+    model.set_env(World())
+
+
+@pytest.mark.parametrize(
+    "listeners, saved, change, task",
+    [
+        ([], False, None, 0),
+        ([], True, None, 0),
+        ([], True, task_switched, 1),
+        ([ContinualMetrics], True, None, 0),
+        ([ContinualMetrics], False, task_switched, 1),
+        ([ContinualMetrics], False, give_another_world, 1),
+    ],
+)
+def test_a_model_that_was_trained_without_a_signal_goes_on_with_one(listeners, saved, change, task, tmp_path):
+    """Into the next task, if the task switched after its last step."""
+    model, signal, tasks = make_model("PPO", World()), TaskSignal(switch_every=48), []
+    model.learn(32, [make() for make in listeners])
+    if saved:
+        model.save(tmp_path / "model")
+        model = type(model).load(tmp_path / "model", env=World())
+    if change is not None:
+        change(model)
+    look = Curriculum(lambda _: tasks.append(signal.step_task), at=33)
+    model.learn(32, [signal, look], reset_num_timesteps=False)
+    assert tasks == [task]
+    assert signal.next_task == task + 1  # since step 48
+
+
+def test_what_was_heard_before_the_first_signal_is_not_heard_again():
+    model, signal = make_model("PPO", World()), TaskSignal()
+    model.learn(16, ContinualMetrics())
+    task_switched(model)
+    model.learn(16, ContinualMetrics(), reset_num_timesteps=False)
+    model.learn(16, signal, reset_num_timesteps=False)
+    assert signal.next_task == 0

@@ -1,6 +1,7 @@
 """Looks at a model after its training: churn, the neural tangent kernel, the health of its networks, and what is wrong."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -84,7 +85,9 @@ def inspect_model(
     """
     Roll the model out and train it a little, as its training would go on, and look at it with
     :class:`~sb3_cchain.ChurnMonitor` at each update, :class:`~sb3_cchain.analysis.NTKCallback` where there is a kernel,
-    :class:`~sb3_cchain.analysis.NetworkHealth` and :class:`~sb3_cchain.analysis.Doctor`. This changes the model.
+    :class:`~sb3_cchain.analysis.NetworkHealth` and :class:`~sb3_cchain.analysis.Doctor`. The model has learned from these
+    steps afterwards, and so have the statistics of its ``VecNormalize``: to keep it as it is, inspect a copy that is loaded
+    from a file. Its logger and its other settings stay as they are.
 
     On-policy, that is one iteration. Off-policy, ``n_steps`` steps fill a replay buffer, which is not saved with a model, and
     ``n_updates`` updates are made on it. What has a schedule (learning rate, clipping range, exploration) has the value of the
@@ -110,28 +113,30 @@ def inspect_model(
         inspection.symptoms = weight_symptoms(model)
         inspection.findings = diagnose(inspection.symptoms, model)
     elif isinstance(model, (OnPolicyAlgorithm, OffPolicyAlgorithm)):
-        n_steps = _prepare_one_iteration(model, n_steps, n_updates)
-        _look_while_training(inspection, model, n_steps, callbacks)
+        with _one_iteration(model, n_steps, n_updates) as n_steps:
+            _look_while_training(inspection, model, n_steps, callbacks)
     else:
         inspection.symptoms, inspection.figures = _roll_out(model, n_steps)
         inspection.findings = diagnose(inspection.symptoms, model)
     return inspection
 
 
-def _prepare_one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, n_updates: int) -> int:
-    """
-    :return: Environment steps of the iteration
-    """
-    model.set_logger(Logger(folder=None, output_formats=[]))
+@contextmanager
+def _one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, n_updates: int) -> Iterator[int]:
+    """Settings of the model for the iteration, and its environment steps. The model's own settings come back afterwards."""
+    settings: dict[str, Any] = {"_logger": Logger(folder=None, output_formats=[]), "_custom_logger": True}
     if isinstance(model, OnPolicyAlgorithm):
         n_steps = model.n_steps * model.n_envs
     else:
-        model.learning_starts = model.num_timesteps  # the rollout that fills the buffer has no random actions
-        model.train_freq = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
-        model.gradient_steps = n_updates
+        settings["learning_starts"] = model.num_timesteps  # the rollout that fills the buffer has no random actions
+        settings["train_freq"] = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)
+        settings["gradient_steps"] = n_updates
     # All episodes of this rollout, and no others
-    model.ep_info_buffer, model._stats_window_size = None, n_steps
-    return n_steps
+    settings |= {"ep_info_buffer": None, "_stats_window_size": n_steps}
+    with ExitStack() as stack:
+        for name, value in settings.items():
+            stack.enter_context(replaced(model, name, value))
+        yield n_steps
 
 
 def _look_while_training(

@@ -145,10 +145,22 @@ def task_count(model: BaseAlgorithm) -> int:
     """
     if model.num_timesteps == 0:
         model.task_count = 0  # type: ignore[attr-defined]
+        _counts_before.pop(model, None)
     elif has_other_env(model):
         _count_one_more(model)
+    elif not hasattr(model, "task_count"):  # it was trained before without anybody who counts
+        model.task_count = 0  # type: ignore[attr-defined]
     _last_envs[model] = ref(_single_env(model))
-    return getattr(model, "task_count", 0)
+    return model.task_count  # type: ignore[attr-defined]
+
+
+def count_before_step(model: BaseAlgorithm) -> int:
+    """
+    :param model: A model during ``learn()``
+    :return: :func:`task_count`, without what was counted since the last step
+    """
+    step, count = _counts_before.get(model, (None, 0))
+    return count if step == model.num_timesteps else task_count(model)
 
 
 def has_other_env(model: BaseAlgorithm) -> bool:
@@ -184,5 +196,12 @@ def task_switched(model: BaseAlgorithm) -> None:
     _count_one_more(model)
 
 
+# For each model the step at which it was last counted, and the count before that
+_counts_before: WeakKeyDictionary[BaseAlgorithm, tuple[int, int]] = WeakKeyDictionary()
+
+
 def _count_one_more(model: BaseAlgorithm) -> None:
-    model.task_count = getattr(model, "task_count", 0) + 1  # type: ignore[attr-defined]
+    count = getattr(model, "task_count", 0)
+    if _counts_before.get(model, (None, 0))[0] != model.num_timesteps:
+        _counts_before[model] = model.num_timesteps, count
+    model.task_count = count + 1  # type: ignore[attr-defined]

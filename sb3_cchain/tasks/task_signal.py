@@ -13,6 +13,7 @@ from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.drift import Drift
 from sb3_cchain.tasks.signal import (
     TASK_KEY,
+    count_before_step,
     episode_goes_on,
     first_reset_info,
     has_other_env,
@@ -131,11 +132,13 @@ class TaskSignal(BaseCallback):
                 "`set_env()` gave another environment, but this `learn()` begins anew, at step 0 of task 0. To go on in it as "
                 "the next task, call `learn(..., reset_num_timesteps=False)`."
             )
-        if self.num_timesteps == 0 or not hasattr(self.model, "task_signal"):
-            self.model.task_signal = {"task": 0, "reports": {}}  # type: ignore[attr-defined]
         self._start_time = self.model.start_time
         register_signal(self)
         task_count(self.model)  # set_env() may have given another environment
+        if self.num_timesteps == 0 or not hasattr(self.model, "task_signal"):
+            # The model may have been trained without this callback, and the task have switched since its last step
+            reports = {"count": count_before_step(self.model)}
+            self.model.task_signal = {"task": 0, "reports": reports}  # type: ignore[attr-defined]
         # In an episode that goes on, steps have told more than the info that it began with
         began = {} if episode_goes_on(self.model) else first_reset_info(self.training_env)
         self._hear(self._in_info(began), self._between_steps())
