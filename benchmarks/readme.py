@@ -1,9 +1,10 @@
 """
-The table and the picture of the README, from the committed results of Gym Control. Trains nothing.
+The table and the picture of the README, and the tables behind them in the documentation, from the committed results of Gym
+Control. Trains nothing.
 
-    python -m benchmarks.run --suite gym_control --budget reduced --method cchain vanilla oracle --seeds 2   # makes the runs
-    python -m benchmarks.readme            # prints the table
-    python -m benchmarks.readme --write    # table and picture, into the README
+    python -m benchmarks.run --suite gym_control --method vanilla cchain oracle --seeds 1   # makes the runs
+    python -m benchmarks.readme            # prints the tables
+    python -m benchmarks.readme --write    # tables and picture, into README and documentation
 """
 
 import argparse
@@ -11,17 +12,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.grid.results import Result, read_results
-from benchmarks.grid.run import ROOT, short_name
+from benchmarks.grid.run import ROOT, short_name, suite_lines
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cell, Cells, make_cells
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
 from benchmarks.report.places import write_tables
 from benchmarks.report.tables import method_label
+from benchmarks.report.task_tables import MISSING, returns_header, returns_rows
 from sb3_cchain.analysis.curves import smoothed
 from sb3_cchain.analysis.plots import import_matplotlib
 
-SUITE, BUDGET = "gym_control", "reduced"
+SUITE, BUDGET = "gym_control", "paper"
 METHODS = ("oracle", "vanilla", "cchain")
 
 # A policy has collapsed where the mean return of the last ten rollouts of a task is below this. The best policy that repeats
@@ -29,10 +31,10 @@ METHODS = ("oracle", "vanilla", "cchain")
 # where a policy that has not found the goal yet looks the same. Other runs may learn something and still end below this
 COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Continual/LunarLander-v3": -100}
 
-# The picture: an environment where PPO collapses with both seeds
+# The picture
 PICTURED = "Continual/LunarLander-v3"
 PICTURE = ROOT / "docs/images/loss_of_plasticity.png"
-TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: recovers, with one exception"}
+TITLES = {"vanilla": "PPO: stops learning", "cchain": "C-CHAIN PPO: recovers, except in one task"}
 
 
 def read_cells(results: Path) -> Cells:
@@ -66,10 +68,11 @@ def readme_table(cells: Cells) -> str:
     paper = read_tables()[SUITE]
     rows = []
     for env_id in SUITES[SUITE].env_ids:
-        here = [cells[env_id, method] for method in METHODS]
+        here = [cells.get((env_id, method)) for method in METHODS]
+        done = [cell for cell in here if cell is not None]
         figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
-        lengths = f"{here[0].results[0].n_tasks} × {here[0].results[0].steps_per_task // 1000} 000"
-        seeds = ", ".join(sorted({" ".join(map(str, cell.seeds)) for cell in here}))
+        lengths = f"{done[0].results[0].n_tasks} × {done[0].results[0].steps_per_task // 1000} 000"
+        seeds = ", ".join(sorted({" ".join(map(str, cell.seeds)) for cell in done}))
         printed = [f"{figure.mean:.0f} ± {figure.standard_error:.0f}" for figure in figures]
         rows.append([short_name(env_id), lengths, seeds, *map(_score, here), *printed])
     labels = [method_label(SUITE, method) for method in METHODS]
@@ -87,7 +90,24 @@ def readme_table(cells: Cells) -> str:
     return f"{markdown_table(header, rows)}\n\n{sentence}"
 
 
-def _score(cell: Cell) -> str:
+def task_tables(results: Path) -> str:
+    """
+    :param results: Folder of all results
+    :return: The mean return of each run on each task, a table for each environment
+    """
+    runs, _ = read_results(results / BUDGET / SUITE)
+    lines = suite_lines(SUITE, {run.line for run in runs})
+    parts = []
+    for env_id in SUITES[SUITE].env_ids:
+        here = [run for run in runs if run.env_id == env_id]
+        header = returns_header([str(task) for task in range(here[0].n_tasks)])
+        parts.append(f"{short_name(env_id)}:\n\n{markdown_table(header, returns_rows(here, lines, digits=0))}")
+    return "\n\n".join(parts)
+
+
+def _score(cell: Cell | None) -> str:
+    if cell is None:
+        return MISSING
     return f"{cell.mean:.0f}" if cell.error is None else f"{cell.mean:.0f} ± {cell.error:.0f}"
 
 
@@ -110,7 +130,8 @@ def plot(cells: Cells, path: Path) -> None:
                 panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=label)
         for end in results[0].task_boundaries[:-1]:
             panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
-        panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
+        if (PICTURED, "oracle") in cells:
+            panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
         panel.set_title(title, fontweight="bold")
         panel.set_xlabel("environment steps; the world changes at the dashed lines")
         panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
@@ -126,16 +147,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=ROOT / "benchmarks/results", help="Folder of all results")
-    parser.add_argument("--write", action="store_true", help="Put table and picture into the README")
+    parser.add_argument("--write", action="store_true", help="Put tables and picture into README and documentation")
     args = parser.parse_args(arguments)
     cells = read_cells(args.results)
-    missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in METHODS if (env_id, method) not in cells]
+    missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in TITLES if (env_id, method) not in cells]
     if missing:
         parser.error(f"--results must have runs of {', '.join(missing)}; there are none in {args.results}")
-    table = readme_table(cells)
-    print(table)
+    table, tables_of_tasks = readme_table(cells), task_tables(args.results)
+    print(table, tables_of_tasks, sep="\n\n")
     if args.write:
         write_tables({"readme": table}, ROOT / "README.md")
+        write_tables({"gym_control_tasks": tables_of_tasks}, ROOT / "docs")
         plot(cells, PICTURE)
 
 
