@@ -164,6 +164,7 @@ def test_a_shorter_run_is_named(tmp_path, capsys):
         (["-r", "PPO", "one.csv", "-r", "PPO", "one.csv"], "--runs must have another label for each method; got PPO 2 times"),
         (["-r", "PPO", "one.csv", "-w", "0"], "--window must be at least 1; got 0"),
         (["-r", "PPO", "one.csv", "-o", "one.csv/curves.png"], "--output one.csv/curves.png: "),
+        (["-r", "PPO", "one.csv", "-o", "empty"], "--output empty: it is a folder. Give the path of a file"),
         (["-r", "PPO", "one.csv", "-o", "curves.doc"], "Format 'doc' is not supported"),
         (["-r", "PPO", "empty"], "empty must be a file of returns or have returns.csv in it, which training with -tb writes"),
         (["-r", "PPO", "nothing.csv"], "No such file or directory: 'nothing.csv'"),

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
-from sb3_cchain.checkpoint import check_writable
+from sb3_cchain.zoo.outputs import check_output_file
 
 # A run that is this much shorter than the longest is not of the same length: episodes end a little before the last step
 SHORT = 0.95
@@ -76,10 +76,7 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     if args.window < 1:
         parser.error(f"--window must be at least 1; got {args.window}")
     if args.output is not None:
-        try:
-            check_writable(args.output.parent)
-        except OSError as error:
-            parser.error(f"--output {args.output}: {error.strerror}. Give a path in a folder that can be written to")
+        check_output_file(parser, "--output", args.output)
 
 
 def read_runs(paths: Sequence[str], console: Console) -> dict[Path, Rows]:

@@ -30,11 +30,12 @@ from sb3_cchain.analysis.inspection import Inspection, inspect_model
 from sb3_cchain.analysis.inspection_report import findings_text, plot, report
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
-from sb3_cchain.checkpoint import check_model_file, check_writable
+from sb3_cchain.checkpoint import check_model_file
 from sb3_cchain.checkpoint.checkpoint_folder import MODEL
 from sb3_cchain.checkpoint.files import load_statistics
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
+from sb3_cchain.zoo.outputs import check_output_file, check_output_folder
 from sb3_cchain.zoo.settings import read_saved
 from sb3_cchain.zoo.statistics import checkpoint_statistics
 
@@ -248,17 +249,9 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     for path in [*args.models, *([args.vec_normalize] if args.vec_normalize else [])]:
         if not path.is_file():
             parser.error(f"no such file: {path}")
-    try:
-        check_writable(args.output)
-    except OSError as error:
-        parser.error(f"--output {args.output}: {error.strerror}. Give a folder that can be written to")
+    check_output_folder(parser, "--output", args.output)
     if args.html is not None:
-        try:
-            check_writable(args.html.parent)
-        except OSError as error:
-            parser.error(f"--html {args.html}: {error.strerror}. Give a path in a folder that can be written to")
-        if args.html.is_dir():
-            parser.error(f"--html {args.html}: it is a folder. Give the path of a file")
+        check_output_file(parser, "--html", args.html)
 
 
 def main(arguments: Sequence[str]) -> int:
