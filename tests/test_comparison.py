@@ -157,6 +157,16 @@ def test_a_shorter_run_is_named(tmp_path, capsys):
     assert re.search(r"\| 0 +\| +2 \|", output) and not re.search(r"\n\| 1 ", output)
 
 
+def test_seeds_that_are_alike_all_count(tmp_path, capsys):
+    """Such as those that have collapsed to the worst return. Labels are taken as they are."""
+    for seed, last in enumerate((-400.0, -400.0, -100.0)):
+        write(tmp_path / f"seed_{seed}" / "returns.csv", run_with([-400.0] * 3, [last] * 3))
+    command("compare", "--runs", "[b]PPO[/]", tmp_path)
+    output = capsys.readouterr().out
+    assert "Left out" not in output and "[b]PPO[/]" in output
+    assert re.search(r"\| runs +\| +3 \|", output) and re.search(r"\| J\(T\) +\| +-350 \|", output)
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -164,8 +174,9 @@ def test_a_shorter_run_is_named(tmp_path, capsys):
         (["-r", "PPO", "one.csv", "-r", "PPO", "one.csv"], "--runs must have another label for each method; got PPO 2 times"),
         (["-r", "PPO", "one.csv", "-w", "0"], "--window must be at least 1; got 0"),
         (["-r", "PPO", "one.csv", "-o", "one.csv/curves.png"], "--output one.csv/curves.png: "),
-        (["-r", "PPO", "one.csv", "-o", "empty"], "--output empty: it is a folder. Give the path of a file"),
-        (["-r", "PPO", "one.csv", "-o", "curves.doc"], "Format 'doc' is not supported"),
+        (["-r", "PPO", "one.csv", "-o", "folder.png"], "--output folder.png: it is a folder. Give the path of a file"),
+        (["-r", "PPO", "one.csv", "-o", "curves.doc"], "--output must end in one of "),
+        (["-r", "PPO", "one.csv", "-o", "curves"], "; got curves"),
         (["-r", "PPO", "empty"], "empty must be a file of returns or have returns.csv in it, which training with -tb writes"),
         (["-r", "PPO", "nothing.csv"], "No such file or directory: 'nothing.csv'"),
         (["-r", "PPO", "none.csv"], "No episode has ended yet in the runs none.csv"),
@@ -180,6 +191,7 @@ def test_wrong_arguments(arguments, message, tmp_path, monkeypatch, capsys):
     write(tmp_path / "none.csv", [])
     write(tmp_path / "task_5.csv", [{**row, "task_id": 5} for row in run_with([1.0])])
     (tmp_path / "empty").mkdir()
+    (tmp_path / "folder.png").mkdir()
     (tmp_path / "other.csv").write_text("step,value\n1,2\n")
     (tmp_path / "damaged.csv").write_text((tmp_path / "one.csv").read_text()[:-3])
     with pytest.raises(SystemExit) as ended:

@@ -311,10 +311,12 @@ def test_a_model_goes_on_with_its_own_settings_and_logger(algorithm, tmp_path):
     settings = {
         name: vars(model).get(name) for name in ("train_freq", "gradient_steps", "learning_starts", "_stats_window_size")
     }
+    model.ep_success_buffer.append(True)
     episodes = list(model.ep_info_buffer)
     inspect_model(model, n_steps=16, n_updates=2)
     assert settings == {name: vars(model).get(name) for name in settings}
     assert model.logger is logger and list(model.ep_info_buffer) == episodes
+    assert list(model.ep_success_buffer) == [True] and model.ep_success_buffer.maxlen == 100
     model.learn(64, log_interval=1, reset_num_timesteps=False)
     assert "rollout/ep_rew_mean" in (tmp_path / "progress.csv").read_text()
 

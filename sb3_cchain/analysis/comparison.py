@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 from sb3_cchain.analysis.curves import Series, band, smoothed
@@ -55,7 +56,7 @@ def comparison_table(methods: Methods) -> Table:
     table = Table(box=box.ASCII)
     table.add_column("task")
     for label in methods:
-        table.add_column(label, justify="right", overflow="fold")
+        table.add_column(escape(label), justify="right", overflow="fold")
     table.add_row("runs", *(str(len(runs)) for runs in methods.values()), end_section=True)
     for i, task in enumerate(tasks):
         table.add_row(str(task), *(f"{each[:, i].mean():.4g}" for each in returns.values()), end_section=task == tasks[-1])
@@ -63,7 +64,7 @@ def comparison_table(methods: Methods) -> Table:
     table.add_row("95 % interval", *(_interval_text(mean_interval(each)) for each in scores.values()), end_section=True)
     if len(methods) > 1:
         others = [scores[label] for label in methods if label != first]
-        table.add_row(f"minus {first}", "", *(f"{np.mean(each) - np.mean(scores[first]):.4g}" for each in others))
+        table.add_row(escape(f"minus {first}"), "", *(f"{np.mean(each) - np.mean(scores[first]):.4g}" for each in others))
         intervals = [difference_interval(each, scores[first]) for each in others]
         table.add_row("95 % interval", "", *map(_interval_text, intervals))
     return table

@@ -132,7 +132,7 @@ def _one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, 
         settings["train_freq"] = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)
         settings["gradient_steps"] = n_updates
     # All episodes of this rollout, and no others
-    settings |= {"ep_info_buffer": None, "_stats_window_size": n_steps}
+    settings |= {"ep_info_buffer": None, "ep_success_buffer": None, "_stats_window_size": n_steps}
     with ExitStack() as stack:
         for name, value in settings.items():
             stack.enter_context(replaced(model, name, value))

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison
+from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
 from sb3_cchain.zoo.outputs import check_output_file
 
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
         console.print(comparison_table(returns))
         if args.output is not None:
             draw_comparison(returns, args.window).savefig(args.output)
-            console.print(f"Written: {args.output}", soft_wrap=True)
+            console.print(f"Written: {args.output}", soft_wrap=True, highlight=False, markup=False)
     except (ImportError, OSError, ValueError) as error:
         parser.error(str(error))
 
@@ -76,6 +77,12 @@ def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -
     if args.window < 1:
         parser.error(f"--window must be at least 1; got {args.window}")
     if args.output is not None:
+        try:
+            formats = import_matplotlib().figure.Figure().canvas.get_supported_filetypes()
+        except ImportError as error:
+            parser.error(str(error))
+        if args.output.suffix[1:] not in formats:
+            parser.error(f"--output must end in one of {', '.join(f'.{name}' for name in formats)}; got {args.output}")
         check_output_file(parser, "--output", args.output)
 
 
@@ -94,10 +101,11 @@ def read_runs(paths: Sequence[str], console: Console) -> dict[Path, Rows]:
         files.update({file.resolve(): read_returns(file) for file in found})
     runs: dict[Path, Rows] = {}
     for file, rows in sorted(files.items(), key=lambda item: len(item[1]), reverse=True):
-        longer = next((other for other, its_rows in runs.items() if its_rows[: len(rows)] == rows), None)
+        # Runs of the same length are of different seeds, even where both have the worst return throughout
+        longer = next((f for f, other in runs.items() if len(other) > len(rows) and other[: len(rows)] == rows), None)
         if not rows or longer is not None:
             why = f"the beginning of {longer}" if rows else "without a row"
-            console.print(f"Left out: {file}, {why}", soft_wrap=True, highlight=False)
+            console.print(f"Left out: {file}, {why}", soft_wrap=True, highlight=False, markup=False)
         else:
             runs[file] = rows
     if not runs:
@@ -121,4 +129,5 @@ def print_lengths(methods: dict[str, dict[Path, Rows]], console: Console) -> Non
                 "them perhaps in part",
                 soft_wrap=True,
                 highlight=False,
+                markup=False,
             )
