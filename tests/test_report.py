@@ -696,9 +696,9 @@ DAMAGES = {
         lambda path: (path / "returns.csv").write_text(f"timesteps,task_id,n_episodes,mean_return\n{10**30},0,1,1\n"),
         "counts that are out of range",
     ),
-    "a budget without a command": (
-        lambda path: (path / "run.json").write_text('{"budget": "smoke"}'),
-        "is not a result ('command')",
+    "a part of run.json": (
+        lambda path: (path / "run.json").write_text('{"experiment": "smoke"}'),
+        "is not a result (Result.__init__() missing",
     ),
     "run.json that is a folder": (
         lambda path: ((path / "run.json").unlink(), (path / "run.json").mkdir()),

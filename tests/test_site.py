@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from benchmarks.readme import read_cells, readme_table
+from benchmarks.readme import read_cells, readme_table, task_tables
 from benchmarks.report.places import PLACE
 from tests.test_docs import ALL_PAGES, ROOT, name_of, without_code
 
@@ -95,8 +95,9 @@ def tables(page: Path) -> dict[str, str]:
 
 
 def test_the_readme_shows_the_committed_results():
-    shown = tables(ROOT / "README.md")["readme"]
-    assert readme_table(read_cells(ROOT / "benchmarks/results")) in shown, "run python -m benchmarks.readme --write"
+    results, write = ROOT / "benchmarks/results", "run python -m benchmarks.readme --write"
+    assert readme_table(read_cells(results)) in tables(ROOT / "README.md")["readme"], write
+    assert task_tables(results) in tables(DOCS / "results/gym_control.md")["gym_control_tasks"], write
 
 
 # Rows of the tables of the speed page, and the ratio to PPO that is stated elsewhere and in the page's first lines
