@@ -11,7 +11,8 @@ from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
 from sb3_cchain.zoo.outputs import check_output_file
 
-# A run that is this much shorter than the longest is not of the same length: episodes end a little before the last step
+# Runs below this share of the longest one are named. The last rows of runs of one length may differ a little, because
+# episodes end at different steps
 SHORT = 0.95
 
 
