@@ -10,7 +10,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, task_evaluation
@@ -314,11 +314,19 @@ def test_environments_that_do_not_fit(env, eval_env, error, message):
         PPO(policy, training_env, **ARGUMENTS).learn(16, callback=EvalAllTasks(eval_env()))
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: DummyVecEnv([lambda: env])])
-def test_the_environment_of_training_is_refused(wrap):
-    env = wrap(tasks())
+@pytest.mark.parametrize(
+    "make_env, wrap",
+    [
+        (tasks, lambda env: env),
+        (lambda: DummyVecEnv([tasks]), VecMonitor),
+        (lambda: SubprocVecEnv([tasks], start_method="forkserver"), VecMonitor),
+    ],
+)
+def test_the_environment_of_training_is_refused(make_env, wrap):
+    env = make_env()
+    eval_env = wrap(env)
     with pytest.raises(ValueError, match="`eval_env` must be another environment than that of training"):
-        PPO("MlpPolicy", env, **ARGUMENTS).learn(16, callback=EvalAllTasks(env))
+        PPO("MlpPolicy", env, **ARGUMENTS).learn(16, callback=EvalAllTasks(eval_env))
 
 
 def test_a_warning_says_that_episodes_may_never_end(monkeypatch):

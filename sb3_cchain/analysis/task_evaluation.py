@@ -24,6 +24,7 @@ from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_same_tasks
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
+from sb3_cchain.tasks.single_envs import share_envs
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number, check_path
@@ -174,7 +175,7 @@ class TaskEvaluation(BaseCallback):
 
 def _check_fits(eval_env: VecEnv, training_env: VecEnv) -> None:
     """Whether a model that is trained in one environment can be evaluated in the other, without touching the training."""
-    if any(env is trained for env in _single_envs(eval_env) for trained in _single_envs(training_env)):
+    if share_envs(eval_env, training_env):
         raise ValueError("`eval_env` must be another environment than that of training, got the same: make a second one")
     for kind, plural in (("observation_space", "observations"), ("action_space", "actions")):
         expected, given = getattr(training_env, kind), getattr(eval_env, kind)
@@ -189,10 +190,6 @@ def _check_fits(eval_env: VecEnv, training_env: VecEnv) -> None:
             f"`eval_env` must be wrapped as the training environment: {'only that' if expected else 'it alone'} has a "
             "VecNormalize of observations"
         )
-
-
-def _single_envs(env: VecEnv) -> list[Any]:
-    return [single.unwrapped for single in getattr(env.unwrapped, "envs", [env])]
 
 
 def _measures(space: gym.Space[Any]) -> Any:

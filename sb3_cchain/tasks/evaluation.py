@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.continual import is_continual
+from sb3_cchain.tasks.single_envs import share_envs
 
 
 def find_eval_envs(callback: BaseCallback | None) -> list[VecEnv]:
@@ -36,16 +37,11 @@ def check_apart(env: VecEnv, eval_env: VecEnv) -> None:
     :param eval_env: An evaluation environment
     :raises ValueError: When both are the same
     """
-    if {id(each) for each in _innermost(env)} & {id(each) for each in _innermost(eval_env)}:
+    if share_envs(env, eval_env):
         raise ValueError(
             "An EvalCallback must have an environment of its own, because it keeps that on the task being trained. Got the "
             "training environment, whose tasks would not switch any more."
         )
-
-
-def _innermost(env: VecEnv) -> list[object]:
-    inner = env.unwrapped
-    return [single.unwrapped for single in inner.envs] if isinstance(inner, DummyVecEnv) else [inner]
 
 
 def check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:

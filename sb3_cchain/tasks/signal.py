@@ -17,6 +17,8 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cchain.tasks.single_envs import single_envs
+
 # Where an environment that numbers its tasks does so
 TASK_KEY = "task_id"
 
@@ -173,10 +175,7 @@ def has_other_env(model: BaseAlgorithm) -> bool:
 
 def _single_env(model: BaseAlgorithm) -> Any:
     assert model.env is not None
-    env = model.env.unwrapped
-    envs = getattr(env, "envs", None)
-    # set_env() wraps the same environment again
-    return env if envs is None else envs[0].unwrapped
+    return single_envs(model.env)[0]  # set_env() wraps the same environment again
 
 
 def task_switched(model: BaseAlgorithm) -> None:
