@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
 from sb3_cchain.algorithms.churn_state import ChurnState
-from sb3_cchain.networks import policy_outputs
+from sb3_cchain.networks import evaluation_mode
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -100,8 +100,8 @@ def learn_in_double_precision(make, n_timesteps, env="CartPole-v1", policy="MlpP
     model = make(policy, env, **arguments)
     model.policy.double()
     # These extractors act in training as in evaluation, as those of SB3 do
-    packages = (*policy_outputs._MODE_FREE_PACKAGES, extractor.__module__)
-    with patch.object(policy_outputs, "_MODE_FREE_PACKAGES", packages):
+    packages = (*evaluation_mode._MODE_FREE_PACKAGES, extractor.__module__)
+    with patch.object(evaluation_mode, "_MODE_FREE_PACKAGES", packages):
         return model.learn(n_timesteps)
 
 

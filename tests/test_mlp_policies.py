@@ -19,8 +19,8 @@ from sb3_cchain.networks import (
     LayerNormDQNPolicy,
     LayerNormPolicy,
 )
+from sb3_cchain.networks.evaluation_mode import has_training_mode
 from sb3_cchain.networks.extractors import MinAtarCNN
-from sb3_cchain.networks.policy_outputs import has_training_mode
 from tests.envs import RandomEnv
 from tests.method_models import OFF_POLICY, ON_POLICY
 

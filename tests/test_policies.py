@@ -9,9 +9,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_cchain import CChainDQN, CChainPPO
+from sb3_cchain.networks.evaluation_mode import has_training_mode
 from sb3_cchain.networks.extractors import ImpalaCNN, MinAtarCNN
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
-from sb3_cchain.networks.policy_outputs import has_training_mode
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

@@ -7,7 +7,7 @@ from torch import nn
 
 from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.networks import SpectralNormDQNPolicy, SpectralNormLinear, SpectralNormPolicy
-from sb3_cchain.networks.policy_outputs import has_training_mode
+from sb3_cchain.networks.evaluation_mode import has_training_mode
 from tests.method_models import make_model, make_random_env, parameters
 
 NET = dict(net_arch=[8, 8])

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,8 +15,7 @@ from torch.nn import functional as F
 from sb3_cchain.algorithms.q_network import finite_td_loss
 from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.checkpoint import TrainingCheckpoint
-from sb3_cchain.networks.evaluation_mode import evaluation_mode
-from sb3_cchain.networks.policy_outputs import has_training_mode
+from sb3_cchain.networks.evaluation_mode import as_it_acts
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.validation import check_bool, check_choice
 
@@ -115,7 +113,7 @@ class DoubleDQN(ZeroRateWarning, DQN):
         next_q_values = None
         if self.double_q:
             # As the target network: next observations do not move the running statistics of BatchNorm, and no dropout
-            with th.no_grad(), evaluation_mode(self.q_net) if has_training_mode(self.q_net) else nullcontext():
+            with th.no_grad(), as_it_acts(self.q_net):
                 next_q_values = self.q_net(replay_data.next_observations)
         return self.q_net(replay_data.observations), next_q_values
 

@@ -12,8 +12,7 @@ from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
-from sb3_cchain.networks.evaluation_mode import evaluation_mode
-from sb3_cchain.networks.policy_outputs import has_training_mode
+from sb3_cchain.networks.evaluation_mode import evaluation_mode, has_training_mode
 from sb3_cchain.validation import check_choice
 
 

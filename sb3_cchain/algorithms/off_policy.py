@@ -1,7 +1,7 @@
 """Churn reduction of an off-policy algorithm's unmodified ``train()``: where the gradient goes in, and what is logged."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
@@ -15,9 +15,8 @@ from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.churn import ChurnReducer, extra_gradient
 from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.evaluation_mode import evaluation_mode
+from sb3_cchain.networks.evaluation_mode import as_it_acts
 from sb3_cchain.networks.model_optimizers import model_optimizers
-from sb3_cchain.networks.policy_outputs import has_training_mode
 
 
 @contextmanager
@@ -70,7 +69,7 @@ def _hold_still(model: Any, target: ChurnTarget, reducer: ChurnReducer, changes:
     network = getattr(policy, target.optimizer) if target.optimizer else policy
     old: th.Tensor | None = reducer.old_outputs
     # As it acts: the running statistics of BatchNorm do not move, and the noise of dropout is no churn
-    with evaluation_mode(network) if has_training_mode(network) else nullcontext():
+    with as_it_acts(network):
         new = reducer.backward(reference)
     if new is not None:
         assert old is not None

@@ -27,10 +27,9 @@ from sb3_cchain.churn.component import COMPONENTS
 from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.evaluation_mode import evaluation_mode
+from sb3_cchain.networks.evaluation_mode import evaluation_mode, has_training_mode
 from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly, has_convolutions
 from sb3_cchain.networks.policy_inputs import rows
-from sb3_cchain.networks.policy_outputs import has_training_mode
 from sb3_cchain.replaced import replaced
 from sb3_cchain.validation import check_choice, check_number
 

@@ -7,9 +7,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_cchain.networks.evaluation_mode import has_training_mode
 from sb3_cchain.networks.policy_inputs import joined, n_observations
 from sb3_cchain.networks.policy_networks import PolicyNetworks, is_instrumented
-from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution, has_training_mode
+from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution
 
 
 class Evaluation(NamedTuple):

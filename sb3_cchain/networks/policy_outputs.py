@@ -1,4 +1,4 @@
-"""The outputs of an SB3 actor-critic policy, by kind of action distribution; how any policy acts."""
+"""The outputs of an SB3 actor-critic policy, by kind of action distribution."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,25 +20,6 @@ from torch.nn import functional as F
 
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.policy_networks import PolicyNetworks
-from sb3_cchain.networks.spectral_norm import SpectralNormLinear
-
-# Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
-_MODE_FREE_PACKAGES = (
-    "stable_baselines3.",
-    "sb3_cchain.",
-    # Not `common.torch_layers`, which has BatchRenorm
-    *(f"sb3_contrib.{package}." for package in ("common.maskable", "common.recurrent", "crossq", "qrdqn", "tqc")),
-    "torch._dynamo.eval_frame",  # what torch.compile() wraps around a module
-    "torch.nn.modules.activation",
-    "torch.nn.modules.container",
-    "torch.nn.modules.conv",
-    "torch.nn.modules.flatten",
-    "torch.nn.modules.linear",
-    "torch.nn.modules.normalization",
-    "torch.nn.modules.pooling",
-    "torch.nn.modules.rnn",
-)
-_MODE_DEPENDENT_MODULES = (nn.RReLU, nn.MultiheadAttention, SpectralNormLinear)
 
 
 def policy_outputs(policy: ActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
@@ -127,17 +108,3 @@ def distribution_outputs(distribution: Distribution) -> th.Tensor:
 def _stack_padded(sub_actions: Sequence[th.Tensor]) -> th.Tensor:
     width = max(probs.shape[1] for probs in sub_actions)
     return th.stack([F.pad(probs, (0, width - probs.shape[1])) for probs in sub_actions], dim=1)
-
-
-def has_training_mode(policy: nn.Module) -> bool:
-    """
-    :param policy: A policy
-    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, or
-        a module that is not known here
-    """
-    return any(
-        not type(module).__module__.startswith(_MODE_FREE_PACKAGES)
-        or isinstance(module, _MODE_DEPENDENT_MODULES)
-        or (isinstance(module, nn.RNNBase) and module.dropout > 0)
-        for module in policy.modules()
-    )
