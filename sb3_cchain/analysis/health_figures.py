@@ -20,7 +20,7 @@ from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.forward_hooks import forward_hooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
-from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
+from sb3_cchain.networks.policy_inputs import episode_start
 
 
 def network_health(model: BaseAlgorithm, observations: PyTorchObs, tau: float = 0.025) -> dict[str, float]:
@@ -189,6 +189,5 @@ def _act(policy: Any, observations: PyTorchObs) -> Any:
         is_ars = hasattr(policy, "action_net") and not hasattr(policy, "predict_values")
         # ARS never acts at random, and has no such argument
         return policy(observations) if is_ars else policy(observations, deterministic=True)
-    memory = empty_memory(policy, observations)
-    episode_starts = th.ones(n_observations(observations), device=policy.device)
+    memory, episode_starts = episode_start(policy, observations)
     return policy(observations, SimpleNamespace(pi=memory, vf=memory), episode_starts, deterministic=True)

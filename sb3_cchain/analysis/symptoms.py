@@ -22,7 +22,7 @@ from sb3_cchain.networks.activations import CReLU
 from sb3_cchain.networks.batch_outputs import Batch, policy_kind
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
-from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
+from sb3_cchain.networks.policy_inputs import episode_start
 
 # By name; of parts of the networks by "name/part"
 Symptoms = dict[str, float]
@@ -133,8 +133,7 @@ def action_std(model: BaseAlgorithm, batch: Batch) -> th.Tensor | None:
             if not isinstance(policy.action_dist, StateDependentNoiseDistribution):
                 return policy.log_std.exp().reshape(1, -1)
             if hasattr(policy, "lstm_actor"):
-                starts = th.ones(n_observations(observations), device=policy.device)
-                distribution, _ = policy.get_distribution(observations, empty_memory(policy, observations), starts)
+                distribution, _ = policy.get_distribution(observations, *episode_start(policy, observations))
             else:
                 distribution = policy.get_distribution(observations)
             return distribution.distribution.stddev

@@ -10,7 +10,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_cchain.networks.policy_inputs import empty_memory, n_observations
+from sb3_cchain.networks.policy_inputs import episode_start
 from sb3_cchain.networks.policy_outputs import distribution_outputs, policy_outputs
 
 # "observations", a tensor or a dict of tensors, as the networks get them; "actions", "action_masks", and the inputs of
@@ -62,9 +62,8 @@ def recurrent_values(policy: Any, batch: Batch) -> th.Tensor:
 
 
 def _memory(policy: Any, batch: Batch) -> tuple[tuple[th.Tensor, th.Tensor], th.Tensor]:
-    observations = batch["observations"]
     if "lstm_states" not in batch:
-        return empty_memory(policy, observations), th.zeros(n_observations(observations), device=policy.device)
+        return episode_start(policy, batch["observations"])
     return (batch["lstm_states"]["hidden"], batch["lstm_states"]["cell"]), batch["episode_starts"]
 
 

@@ -36,12 +36,13 @@ def rows(observations: PyTorchObs, chosen: slice) -> PyTorchObs:
     return observations[chosen]
 
 
-def empty_memory(policy: Any, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+def episode_start(policy: Any, observations: PyTorchObs) -> tuple[tuple[th.Tensor, th.Tensor], th.Tensor]:
     """
     :param policy: A recurrent policy of sb3-contrib
-    :param observations: Batch of observations
-    :return: Hidden state and cell state of its LSTM at the beginning of an episode, for each observation
+    :param observations: Batch of observations, each the first of an episode
+    :return: What the policy takes beside them: the hidden state and the cell state of its LSTM, and that an episode starts
     """
     n_layers, _, size = policy.lstm_hidden_state_shape
-    zeros = th.zeros(n_layers, n_observations(observations), size, device=policy.device)
-    return zeros, zeros
+    n_episodes = n_observations(observations)
+    zeros = th.zeros(n_layers, n_episodes, size, device=policy.device)
+    return (zeros, zeros), th.ones(n_episodes, device=policy.device)
