@@ -89,9 +89,7 @@ def known_kind(model: BaseAlgorithm) -> PolicyKind:
 
 def _outputs_of_kind(kind: PolicyKind, policy: Any, batch: Batch) -> ModelOutputs:
     actions = None if kind.actions is None else kind.actions(policy, batch)
-    values = None if kind.values is None else kind.values(policy, batch)
-    if values is not None and values.dim() > 2:
-        values = values.mean(dim=kind.quantiles)
+    values = None if kind.values is None else kind.mean_values(policy, batch)
     if actions is None:
         assert values is not None
         return ModelOutputs(values=values, greedy_actions=values.argmax(dim=1))

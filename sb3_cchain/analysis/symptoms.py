@@ -262,17 +262,13 @@ def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[NDArra
     sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
     policy: Any = uncompiled(model.policy)
     kind = policy_kind(policy)
-    assert kind is not None and kind.values is not None
+    assert kind is not None
 
     def values_of(observations: Any, actions: th.Tensor | None) -> th.Tensor:
         if kind.actions is not None and actions is None:
             actions = kind.actions(policy, {"observations": observations})
-        values = kind.values(policy, {"observations": observations, "actions": actions})  # type: ignore[misc]
-        if values.dim() > 2:
-            values = values.mean(dim=kind.quantiles)
-        if kind.actions is not None:
-            return values.mean(dim=1)
-        return values.max(dim=1).values
+        values = kind.mean_values(policy, {"observations": observations, "actions": actions})
+        return values.max(dim=1).values if kind.actions is None else values.mean(dim=1)
 
     with th.no_grad(), evaluation_mode(policy):
         values = values_of(sample.observations, sample.actions)

@@ -121,6 +121,16 @@ class PolicyKind:
     values: OutputsOf | None = None
     quantiles: int = 1
 
+    def mean_values(self, policy: Any, batch: Batch) -> th.Tensor:
+        """
+        :param policy: A policy of this kind, which has values
+        :param batch: A batch
+        :return: Its values; where a network predicts their quantiles, the mean of these
+        """
+        assert self.values is not None
+        values = self.values(policy, batch)
+        return values.mean(dim=self.quantiles) if values.dim() > 2 else values
+
 
 def policy_kind(policy: nn.Module) -> PolicyKind | None:
     """
