@@ -123,7 +123,7 @@ def _unit_health(policy: BasePolicy, observations: PyTorchObs, tau: float) -> di
     for name, outputs in hidden_activations(policy, observations).items():
         module, group = policy.get_submodule(name), group_of(name)
         for output in outputs:
-            units = output.unflatten(1, (2, -1)).sum(dim=1) if isinstance(module, CReLU) else output
+            units = unit_outputs(module, output)
             dormant.setdefault(group, []).append(dormant_scores(mean_activity(units)) <= tau)
             if isinstance(module, (*RECTIFIERS, CReLU)):
                 active.setdefault(group, []).append(units > 0)
@@ -181,6 +181,16 @@ def hidden_activations(policy: Any, observations: PyTorchObs) -> dict[str, list[
         if hasattr(policy, "actor"):
             watch(lambda: policy.critic(observations, actions))
     return activations
+
+
+def unit_outputs(module: nn.Module, output: th.Tensor) -> th.Tensor:
+    """
+    :param module: An activation function
+    :param output: What it gave, ``(n_observations, n_features, ...)``
+    :return: The outputs of the units, ``(n_observations, n_units, ...)``. A unit of CReLU has two features, one of which is 0:
+        its output is their sum
+    """
+    return output.unflatten(1, (2, -1)).sum(dim=1) if isinstance(module, CReLU) else output
 
 
 def _act(policy: Any, observations: PyTorchObs) -> Any:

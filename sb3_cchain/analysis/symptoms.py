@@ -14,11 +14,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from sb3_cchain.analysis.health_figures import group_of, hidden_activations, trained_groups
+from sb3_cchain.analysis.health_figures import group_of, hidden_activations, trained_groups, unit_outputs
 from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.metrics.rank import singular_values, srank
 from sb3_cchain.analysis.model_outputs import ModelOutputs, model_outputs
-from sb3_cchain.networks.activations import CReLU
 from sb3_cchain.networks.batch_outputs import Batch, policy_kind
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
@@ -171,7 +170,7 @@ def network_symptoms(model: BaseAlgorithm, batch: Batch) -> Symptoms:
     for name, outputs in hidden_activations(policy, batch["observations"]).items():
         module, group = policy.get_submodule(name), group_of(name)
         for output in outputs:
-            units = output.unflatten(1, (2, -1)).sum(dim=1) if isinstance(module, CReLU) else output
+            units = unit_outputs(module, output)
             flags.setdefault(f"dormant_units/{group}", []).append(dormant_scores(mean_activity(units)) <= DORMANT)
             if type(module) in _BOUNDED_UNITS:
                 low, high = _BOUNDED_UNITS[type(module)]
