@@ -51,6 +51,13 @@ class _ImageExtractor(BaseFeaturesExtractor):
         return self.linear(self.cnn(images).permute(0, 2, 3, 1).flatten(start_dim=1))
 
 
+def _normalized_layers(n_flatten: int, features_dim: int) -> nn.Sequential:
+    """What follows the convolutions, with a LayerNorm before each ReLU."""
+    return nn.Sequential(
+        nn.LayerNorm(n_flatten), nn.ReLU(), nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim), nn.ReLU()
+    )
+
+
 class MinAtarCNN(_ImageExtractor):
     """
     The network of the MinAtar paper (https://arxiv.org/abs/1903.03176): a convolution of 16 filters, 3×3, stride 1, and a
@@ -71,13 +78,12 @@ class MinAtarCNN(_ImageExtractor):
         super().__init__(observation_space, features_dim, min_size=3)
         convolution = nn.Conv2d(self.n_channels, 16, kernel_size=3)
         n_flatten = 16 * (self.height - 2) * (self.width - 2)
-        layers: list[nn.Module] = [nn.Linear(n_flatten, features_dim), nn.ReLU()]
         if layer_norm:
             self.cnn = nn.Sequential(convolution)
-            layers = [nn.LayerNorm(n_flatten), nn.ReLU(), layers[0], nn.LayerNorm(features_dim), layers[1]]
+            self.linear = _normalized_layers(n_flatten, features_dim)
         else:
             self.cnn = nn.Sequential(convolution, nn.ReLU())
-        self.linear = nn.Sequential(*layers)
+            self.linear = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.ReLU())
 
 
 class ImpalaCNN(_ImageExtractor):
@@ -120,10 +126,10 @@ class ImpalaCNN(_ImageExtractor):
             n_inputs, height, width = n_filters, (height + 1) // 2, (width + 1) // 2
         self.cnn = nn.Sequential(*blocks)
         n_flatten = n_inputs * height * width
-        layers = [nn.ReLU(), nn.Linear(n_flatten, features_dim), nn.ReLU()]
         if layer_norm:
-            layers = [nn.LayerNorm(n_flatten), *layers[:2], nn.LayerNorm(features_dim), layers[2]]
-        self.linear = nn.Sequential(*layers)
+            self.linear = _normalized_layers(n_flatten, features_dim)
+        else:
+            self.linear = nn.Sequential(nn.ReLU(), nn.Linear(n_flatten, features_dim), nn.ReLU())
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -145,8 +151,12 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, n_channels: int):
         super().__init__()
-        convolutions = (nn.Conv2d(n_channels, n_channels, kernel_size=3, padding=1) for _ in range(2))
-        self.residual = nn.Sequential(*(layer for convolution in convolutions for layer in (nn.ReLU(), convolution)))
+        self.residual = nn.Sequential(
+            nn.ReLU(),
+            nn.Conv2d(n_channels, n_channels, kernel_size=3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(n_channels, n_channels, kernel_size=3, padding=1),
+        )
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
