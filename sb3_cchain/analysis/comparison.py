@@ -12,7 +12,7 @@ from rich.table import Table
 from sb3_cchain.analysis.curves import Series, band, smoothed
 from sb3_cchain.analysis.metrics.continual import average_performance
 from sb3_cchain.analysis.metrics.intervals import difference_interval, mean_interval
-from sb3_cchain.analysis.plots import import_matplotlib
+from sb3_cchain.analysis.plots import import_matplotlib, new_figure
 from sb3_cchain.callbacks import task_averages
 
 if TYPE_CHECKING:
@@ -84,9 +84,7 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
     :return: The picture
     :raises ImportError: Without matplotlib
     """
-    matplotlib = import_matplotlib()
-    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
-        figure: Figure = matplotlib.figure.Figure(figsize=(9, 4), dpi=100, layout="constrained")
+    with new_figure(9, 4) as figure:
         axes = figure.add_subplot()
         curves = {label: [_curves(rows, window) for rows in runs] for label, runs in methods.items()}
         for number, (label, runs) in enumerate(curves.items()):
@@ -101,7 +99,7 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
             axes.axvline(steps[-1], color="0.35", linestyle="--", linewidth=1)
         smoothing = f", running mean of {window} rows" if window > 1 else ""
         axes.set(xlabel="environment steps", ylabel=f"mean return{smoothing}")
-        axes.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))  # 20k, 1M
+        axes.xaxis.set_major_formatter(import_matplotlib().ticker.EngFormatter(sep=""))  # 20k, 1M
         axes.spines[["top", "right"]].set_visible(False)
         figure.legend(loc="outside lower center", ncols=min(len(methods), 4), frameon=False)
     return figure

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,19 @@ def import_matplotlib() -> ModuleType:
     return matplotlib
 
 
+@contextmanager
+def new_figure(width: float, height: float) -> Iterator[Figure]:
+    """
+    :param width: In inches
+    :param height: In inches
+    :return: Yields an empty picture, to be drawn in matplotlib's own style: RL Zoo's plots leave that of seaborn behind
+    :raises ImportError: Without matplotlib
+    """
+    matplotlib = import_matplotlib()
+    with matplotlib.style.context("default"):
+        yield matplotlib.figure.Figure(figsize=(width, height), dpi=100, layout="constrained")
+
+
 def plot_ntk(matrix: th.Tensor, title: str) -> Figure:
     """
     :param matrix: An NTK
@@ -35,9 +49,7 @@ def plot_ntk(matrix: th.Tensor, title: str) -> Figure:
     :return: A picture of the matrix
     :raises ImportError: Without matplotlib
     """
-    matplotlib = import_matplotlib()
-    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
-        figure: Figure = matplotlib.figure.Figure(figsize=(4.6, 4), dpi=100, layout="constrained")
+    with new_figure(4.6, 4) as figure:
         figure.colorbar(draw_ntk(figure.add_subplot(), matrix, title), extend="both", label="inner product of gradients")
     return figure
 
@@ -73,10 +85,8 @@ def plot_models(
     :return: The picture
     :raises ImportError: Without matplotlib
     """
-    matplotlib = import_matplotlib()
-    with matplotlib.style.context("default"):  # RL Zoo's plots leave seaborn's style behind
-        heights = [*([4.4] if ntks else []), 1.2 + 0.3 * len(groups) * len(names)]
-        figure: Figure = matplotlib.figure.Figure(figsize=(11, sum(heights)), dpi=100, layout="constrained")
+    heights = [*([4.4] if ntks else []), 1.2 + 0.3 * len(groups) * len(names)]
+    with new_figure(11, sum(heights)) as figure:
         *above, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
         for part in above:
             for axes, ntk in zip(part.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
