@@ -13,7 +13,7 @@ from sb3_cchain.analysis.ntk import has_ntk, policy_ntk, q_ntk
 from sb3_cchain.analysis.plots import import_matplotlib, plot_ntk
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
-from sb3_cchain.callbacks.log_folder import log_folder
+from sb3_cchain.callbacks.log_folder import log_path
 from sb3_cchain.validation import check_number
 
 # When `picture_interval` is not given
@@ -97,8 +97,7 @@ class NTKCallback(TrainingInterval):
         super()._on_training_start()
         if self.picture_interval is None:
             self.picture_interval = self._default_picture_interval()
-        folder = log_folder(self.model)
-        self._folder = self.path or (folder / "ntk" if folder is not None else None)
+        self._folder = self.path or log_path(self.model, "ntk")
 
     def _default_picture_interval(self) -> int:
         try:

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.analysis.random_state import unchanged_random_state
-from sb3_cchain.callbacks.log_folder import log_folder
+from sb3_cchain.callbacks.log_folder import log_path
 from sb3_cchain.callbacks.returns_file import ReturnsFile
 from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.tasks.callback_tree import require_single
@@ -91,8 +91,7 @@ class TaskEvaluation(BaseCallback):
         past = [] if is_new else getattr(self.model, self.kept_as, [])
         self.rows: list[dict[str, Any]] = [row for row in past if row["timesteps"] <= self.num_timesteps]
         setattr(self.model, self.kept_as, self.rows)
-        folder = log_folder(self.model)
-        path = self.path or (folder / self.file_name if folder is not None else None)
+        path = self.path or log_path(self.model, self.file_name)
         self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new, columns=self.columns)
         self._switch = TaskSwitch()
         self._trained_task = None

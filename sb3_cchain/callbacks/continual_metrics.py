@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.callbacks.log_folder import log_folder
+from sb3_cchain.callbacks.log_folder import log_path
 from sb3_cchain.callbacks.returns_file import COLUMNS, RETURNS_CSV, ReturnsFile, read_returns
 from sb3_cchain.tasks.listening import start_listening
 from sb3_cchain.tasks.signal import (
@@ -92,8 +92,7 @@ class ContinualMetrics(BaseCallback):
         self.model.continual_state = self._state  # type: ignore[attr-defined]
         self._switch = TaskSwitch(state["task_id"])
 
-        folder = log_folder(self.model)
-        path = self.path or (folder / RETURNS_CSV if folder is not None else None)
+        path = self.path or log_path(self.model, RETURNS_CSV)
         past = [] if is_new else getattr(self.model, "continual_returns", [])
         if not past and not is_new and path is not None and path.exists():
             past = read_returns(path)

@@ -15,3 +15,13 @@ def log_folder(model: BaseAlgorithm) -> Path | None:
         return None
     folder = model.logger.get_dir()
     return None if folder is None else Path(folder)
+
+
+def log_path(model: BaseAlgorithm, name: str) -> Path | None:
+    """
+    :param model: A model that is being trained
+    :param name: Name of a file or a folder
+    :return: Where it is in :func:`log_folder`; None where there is no such folder
+    """
+    folder = log_folder(model)
+    return None if folder is None else folder / name
