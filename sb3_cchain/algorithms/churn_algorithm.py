@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
@@ -15,6 +15,7 @@ from sb3_cchain.algorithms.reduced_churn import reduced_churn
 from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
+from sb3_cchain.tasks.callback_tree import as_list
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
@@ -139,12 +140,8 @@ class ChurnAlgorithm(ZeroRateWarning):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
-        if callback is None:
-            callback = []  # SB3's stand-in for no callback would be called at each step
-        elif not isinstance(callback, (BaseCallback, list)):
-            callback = ConvertCallback(callback)  # a function
-        given = callback if isinstance(callback, list) else [callback]
-        return super()._init_callback(with_continual_callbacks([*given, FiniteCheck()], self.env), progress_bar)
+        callbacks = with_continual_callbacks([*as_list(callback), FiniteCheck()], self.env)
+        return super()._init_callback(callbacks, progress_bar)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         super()._update_info_buffer(infos, dones)

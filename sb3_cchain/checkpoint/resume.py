@@ -5,7 +5,7 @@ from pathlib import Path
 import gymnasium as gym
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -14,7 +14,7 @@ from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint
 from sb3_cchain.checkpoint.log import further_logger
 from sb3_cchain.checkpoint.object_state import find_named
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
-from sb3_cchain.tasks.callback_tree import iterate_callbacks
+from sb3_cchain.tasks.callback_tree import as_list, iterate_callbacks
 from sb3_cchain.validation import check_number
 
 
@@ -66,7 +66,7 @@ def resume(
         logger = further_logger(checkpoint.info["log"], checkpoint.num_timesteps)
     if logger is not None:
         model.set_logger(logger)
-    callbacks = with_checkpoint(_as_list(callback), checkpoint)
+    callbacks = with_checkpoint(as_list(callback), checkpoint)
     model.learn(remaining, callbacks, reset_num_timesteps=False, **checkpoint.info["learn"])
     return model
 
@@ -95,11 +95,3 @@ def with_checkpoint(given: list[BaseCallback], checkpoint: Checkpoint) -> list[B
             found.go_on_from(checkpoint)
             return given
     return [*given, TrainingCheckpoint.resume_from(checkpoint)]
-
-
-def _as_list(callback: MaybeCallback) -> list[BaseCallback]:
-    if callback is None:
-        return []
-    if isinstance(callback, list):
-        return callback
-    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]

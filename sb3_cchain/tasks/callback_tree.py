@@ -2,7 +2,20 @@
 
 from collections.abc import Iterator
 
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EvalCallback, EventCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+
+def as_list(callback: MaybeCallback) -> list[BaseCallback]:
+    """
+    :param callback: What ``learn()`` was given: a callback, a list of them, a function or None
+    :return: A list of callbacks
+    """
+    if callback is None:
+        return []
+    if isinstance(callback, list):
+        return callback
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
 
 
 def iterate_callbacks(callback: BaseCallback | None) -> Iterator[BaseCallback]:
