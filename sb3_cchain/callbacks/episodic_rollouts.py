@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
+from sb3_cchain.tasks.reset import reset_training_env
 
 
 class EpisodicRollouts(RolloutNormalizedAdvantage):
@@ -32,8 +33,7 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
             raise TypeError(f"EpisodicRollouts does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_rollout_start(self) -> None:
-        self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
-        self.model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
+        reset_training_env(self.model)
         self._returns: list[float] = []  # of the episodes that have ended
         self._returns_so_far = [0.0] * self.training_env.num_envs
 

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
@@ -13,6 +12,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_cchain.checkpoint.environment_state import NO_STATE, named_layers
 from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.tasks.continual import is_continual
+from sb3_cchain.tasks.reset import reset_training_env
 
 
 def lasting_state(env: VecEnv, left_out: list[str]) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def begin_new_episodes(model: BaseAlgorithm, envs: Mapping[str, VecEnv], states:
     Put back what :func:`lasting_state` returned, and begin new episodes in the training environment.
 
     :param model: A model between two rollouts
-    :param envs: The training environment, by the name ``env``, and others
+    :param envs: The training environment and others, by name
     :param states: The state of each
     """
     for name, env in envs.items():
@@ -45,13 +45,7 @@ def begin_new_episodes(model: BaseAlgorithm, envs: Mapping[str, VecEnv], states:
         for position, n_steps in enumerate(states[name]["task_steps"]):
             if n_steps is not None:
                 env.env_method("set_clock", n_steps, indices=position)
-    env = envs["env"]
-    # Wrappers forget in it what belongs to an episode
-    model._last_obs = env.reset()  # type: ignore[assignment]
-    model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        model._last_original_obs = normalize.get_original_obs()
+    reset_training_env(model)  # wrappers forget in it what belongs to an episode
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None and buffer.size() > 0:
         _end_last_episodes(buffer)

@@ -2,13 +2,13 @@
 
 import warnings
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_apart, check_same_tasks, evaluate_on, find_eval_envs
+from sb3_cchain.tasks.reset import reset_training_env
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, first_reset_info
 
 
@@ -39,11 +39,7 @@ class TaskSync(BaseCallback):
             check_same_tasks(env, eval_env)
         if any(env.env_method("set_clock", self.num_timesteps, env.num_envs)):
             # The environments were reset before they were told the time, into an episode of the wrong task
-            self.model._last_obs = env.reset()  # type: ignore[assignment]
-            self.model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-            vec_normalize = self.model.get_vec_normalize_env()
-            if vec_normalize is not None:
-                self.model._last_original_obs = vec_normalize.get_original_obs()
+            reset_training_env(self.model)
         # The environment's own number, whatever the signal is
         self._switch = TaskSwitch(first_reset_info(env)[TASK_KEY])
         self._eval_envs = eval_envs
