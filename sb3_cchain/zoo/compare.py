@@ -9,7 +9,7 @@ from rich.console import Console
 from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison
 from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
-from sb3_cchain.zoo.outputs import check_output_file
+from sb3_cchain.zoo.outputs import check_output_file, print_line
 
 # Runs below this share of the longest one are named. The last rows of runs of one length may differ a little, because
 # episodes end at different steps
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
         console.print(comparison_table(returns))
         if args.output is not None:
             draw_comparison(returns, args.window).savefig(args.output)
-            console.print(f"Written: {args.output}", soft_wrap=True, highlight=False, markup=False)
+            print_line(console, f"Written: {args.output}")
     except (ImportError, OSError, ValueError) as error:
         parser.error(str(error))
 
@@ -106,7 +106,7 @@ def read_runs(paths: Sequence[str], console: Console) -> dict[Path, Rows]:
         longer = next((f for f, other in runs.items() if len(other) > len(rows) and other[: len(rows)] == rows), None)
         if not rows or longer is not None:
             why = f"the beginning of {longer}" if rows else "without a row"
-            console.print(f"Left out: {file}, {why}", soft_wrap=True, highlight=False, markup=False)
+            print_line(console, f"Left out: {file}, {why}")
         else:
             runs[file] = rows
     if not runs:
@@ -125,10 +125,8 @@ def print_lengths(methods: dict[str, dict[Path, Rows]], console: Console) -> Non
     longest = max(ends.values())
     for file, end in ends.items():
         if end < SHORT * longest:
-            console.print(
+            print_line(
+                console,
                 f"Shorter: {file} ends at step {end:,} of {longest:,}. The tasks that all runs have are compared, the last of "
                 "them perhaps in part",
-                soft_wrap=True,
-                highlight=False,
-                markup=False,
             )

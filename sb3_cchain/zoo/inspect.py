@@ -35,7 +35,7 @@ from sb3_cchain.checkpoint.checkpoint_folder import MODEL
 from sb3_cchain.checkpoint.files import load_statistics
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
-from sb3_cchain.zoo.outputs import check_output_file, check_output_folder
+from sb3_cchain.zoo.outputs import check_output_file, check_output_folder, print_line
 from sb3_cchain.zoo.settings import read_saved
 from sb3_cchain.zoo.statistics import checkpoint_statistics
 
@@ -277,7 +277,7 @@ def main(arguments: Sequence[str]) -> int:
     for table in report(inspections):
         console.print(table)
     for inspection in inspections:
-        console.print(f"\n{findings_text(inspection)}\n", markup=False, highlight=False, soft_wrap=True)
+        print_line(console, f"\n{findings_text(inspection)}\n")
     try:
         written = _write(args, inspections)
     except OSError as error:

@@ -1,7 +1,9 @@
-"""Where a command writes is checked before it works."""
+"""What commands write: files, whose places are checked before they work, and lines in the terminal."""
 
 import argparse
 from pathlib import Path
+
+from rich.console import Console
 
 from sb3_cchain.checkpoint import check_writable
 
@@ -34,3 +36,13 @@ def check_output_file(parser: argparse.ArgumentParser, option: str, path: Path) 
         check_writable(path.parent)
     except OSError as error:
         parser.error(f"{option} {path}: {error.strerror}. Give a path in a folder that can be written to")
+
+
+def print_line(console: Console, line: str) -> None:
+    """
+    Print text as it is: not wrapped, so that paths and commands can be copied, and without rich's markup and colours.
+
+    :param console: Where
+    :param line: The text
+    """
+    console.print(line, soft_wrap=True, markup=False, highlight=False)

@@ -23,6 +23,7 @@ from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
 from sb3_cchain.tasks.signal import active_signal
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
+from sb3_cchain.zoo.outputs import print_line
 
 # Episodes that the return at the end of a task is the mean of, at least
 LAST_EPISODES = 10
@@ -140,19 +141,19 @@ class TrainingSummary:
             self._clock, self._names = None, []
         rows = getattr(self._model, "continual_returns", [])
         tasks = summarise_tasks(rows, task_steps(rows, self._clock, self._model.num_timesteps))
-        _print_line(console, self._steps())
+        print_line(console, self._steps())
         if tasks:
             console.print(task_table(tasks, self._names))
             performance = average_performance([task.mean_return for task in tasks])
-            _print_line(console, f"J(T), the mean over the tasks: {performance:.4g}")
+            print_line(console, f"J(T), the mean over the tasks: {performance:.4g}")
             if any(task.episodes == 0 for task in tasks):
-                _print_line(console, "Where no episode has ended, the return is the mean reward per step")
+                print_line(console, "Where no episode has ended, the return is the mean reward per step")
         elif episodes := self._model.ep_info_buffer:
             mean = np.mean([episode["r"] for episode in episodes])
-            _print_line(console, f"Mean return of the last {len(episodes)} episodes: {mean:.4g}")
+            print_line(console, f"Mean return of the last {len(episodes)} episodes: {mean:.4g}")
         places = self._places()
         for title, text in {**places, **self._commands(places)}.items():
-            _print_line(console, f"{title + ':':13}{text}")
+            print_line(console, f"{title + ':':13}{text}")
 
     def _steps(self) -> str:
         model, seconds = self._model, time.monotonic() - self._started
@@ -185,8 +186,3 @@ class TrainingSummary:
         if "Checkpoint" in places and self._resume_command and self._model.num_timesteps < self._model._total_timesteps:
             commands["Go on"] = self._resume_command
         return commands
-
-
-def _print_line(console: Console, line: str) -> None:
-    # Not wrapped, so that paths and commands can be copied
-    console.print(line, soft_wrap=True, markup=False, highlight=False)
