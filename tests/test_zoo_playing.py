@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain import ContinualEnv, TaskSync
 from sb3_cchain.analysis import EvalTrainedTask
-from sb3_cchain.zoo.inspect import make_as_trained
+from sb3_cchain.zoo.as_trained import make_as_trained
 from sb3_cchain.zoo.playing import Playing
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
