@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.doctor.cases import CASES, CHOSEN_ON, Case
-from sb3_cchain.checkpoint.files import save_model, save_statistics
+from sb3_cchain.checkpoint.model_files import save_model, save_statistics
 
 
 @dataclass(frozen=True)

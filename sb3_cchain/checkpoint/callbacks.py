@@ -4,7 +4,8 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
-from sb3_cchain.checkpoint.files import save_model, save_statistics, write_safely
+from sb3_cchain.checkpoint.files import write_safely
+from sb3_cchain.checkpoint.model_files import save_model, save_statistics
 
 
 class SafeCheckpointCallback(CheckpointCallback):

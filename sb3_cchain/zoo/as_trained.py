@@ -16,9 +16,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
-from sb3_cchain.checkpoint import check_model_file
+from sb3_cchain.checkpoint import check_model_file, load_statistics
 from sb3_cchain.checkpoint.checkpoint_folder import MODEL
-from sb3_cchain.checkpoint.files import load_statistics
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
 from sb3_cchain.zoo.settings import read_saved
 from sb3_cchain.zoo.statistics import checkpoint_statistics

@@ -31,7 +31,7 @@ from sb3_cchain.checkpoint import (
     write_safely,
 )
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint
-from sb3_cchain.checkpoint.files import save_statistics
+from sb3_cchain.checkpoint.model_files import save_statistics
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize

@@ -10,8 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_cchain.checkpoint import check_model_file
-from sb3_cchain.checkpoint.files import load_statistics
+from sb3_cchain.checkpoint import check_model_file, load_statistics
 from sb3_cchain.envs import TaskCaption
 from sb3_cchain.zoo.statistics import checkpoint_statistics
 
