@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
 from sb3_cchain import CChainPPO
-from sb3_cchain.algorithms import on_policy, reference_batches
+from sb3_cchain.algorithms import epochs, on_policy
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
 from sb3_cchain.networks import policy_networks
 from tests.churn_models import (
@@ -111,7 +111,7 @@ class OwnDictBuffer(DictRolloutBuffer):
 @each_reference
 def test_buffers_are_read_in_the_same_order(kind, size, monkeypatch):
     held = epoch(70, 32, kind, size)
-    monkeypatch.setattr(reference_batches, "HELD_AT_MOST", 0)
+    monkeypatch.setattr(epochs, "HELD_AT_MOST", 0)
     gathered = epoch(70, 32, kind, size)
     monkeypatch.setattr("tests.test_reference_batches.RolloutBuffer", OwnBuffer)
     own = epoch(70, 32, kind, size)
@@ -130,7 +130,7 @@ def test_dict_observations(buffer_class, limit, monkeypatch):
         for each in (None, buffer_class)
     ]
     for model, held_at_most in zip(models, (2**24, limit), strict=True):
-        monkeypatch.setattr(reference_batches, "HELD_AT_MOST", held_at_most)
+        monkeypatch.setattr(epochs, "HELD_AT_MOST", held_at_most)
         model.set_random_seed(0)
         model.learn(72, log_interval=10**6)
         assert_churn_was_reduced(model)

@@ -3,20 +3,13 @@
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
-import numpy as np
-from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.networks.policy_inputs import joined, n_observations, rows
-from sb3_cchain.replaced import replaced
+from sb3_cchain.algorithms.epochs import draw_epoch
 
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
-
-
-# Rollouts in SB3's buffers whose observations take at most this many bytes are gathered once per epoch, which holds them
-# twice. Larger ones are gathered minibatch by minibatch
-HELD_AT_MOST = 2**24
 
 
 class RolloutReferences(Protocol):
@@ -74,7 +67,7 @@ class ReferenceBatches:
         if batch_size is None:  # TRPO's policy, which no optimiser changes
             yield from self._get(None)
             return
-        epoch, size_before = self._draw_epoch(batch_size), 0
+        epoch, size_before = draw_epoch(self._buffer, self._get, batch_size), 0
         for position, (start, size) in enumerate(self._places(epoch.sizes)):
             # With "next", the reference batch of the minibatch before begins with this minibatch
             self.n_shared = min(size_before, epoch.sizes[position]) if self._kind == "next" else 0
@@ -97,26 +90,6 @@ class ReferenceBatches:
         """As of :class:`RolloutReferences`."""
         assert not needs
         return self.current
-
-    def _draw_epoch(self, batch_size: int | None) -> "_HeldEpoch | _GatheredEpoch":
-        if not self._is_sb3s():
-            minibatches = list(self._get(batch_size))
-            return _HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
-        with replaced(self._buffer, "_get_samples", lambda indices, env=None: indices):
-            epoch = _GatheredEpoch(self._buffer, list(self._get(batch_size)))
-        return epoch.held() if self._n_bytes() <= HELD_AT_MOST else epoch
-
-    def _is_sb3s(self) -> bool:
-        """Whether the buffer draws and gathers minibatches as SB3's do."""
-        get, gather = (getattr(method, "__func__", None) for method in (self._get, self._buffer._get_samples))
-        return get in (RolloutBuffer.get, DictRolloutBuffer.get) and gather in (
-            RolloutBuffer._get_samples,
-            DictRolloutBuffer._get_samples,
-        )
-
-    def _n_bytes(self) -> int:
-        observations = self._buffer.observations
-        return sum(array.nbytes for array in (observations.values() if isinstance(observations, dict) else [observations]))
 
 
 class ReferenceMinibatches:
@@ -181,64 +154,3 @@ class PreviousRollout:
         """As of :class:`RolloutReferences`."""
         assert not needs
         return self._previous
-
-
-class _HeldEpoch:
-    """
-    :param minibatches: The minibatches
-    :param observations: The observations of all of them, one after the other
-    """
-
-    def __init__(self, minibatches: list[Any], observations: PyTorchObs):
-        self.sizes = [n_observations(minibatch.observations) for minibatch in minibatches]
-        self._minibatches = minibatches
-        self._observations = observations
-
-    def minibatch(self, position: int) -> Any:
-        return self._minibatches[position]
-
-    def observations(self, start: int, size: int) -> PyTorchObs:
-        """
-        :param start: Position in the epoch
-        :param size: Number of samples from there; the epoch's first follow its last
-        :return: Their observations
-        """
-        beyond = max(start + size - n_observations(self._observations), 0)
-        samples = rows(self._observations, slice(start, start + size - beyond))
-        return joined(samples, rows(self._observations, slice(beyond))) if beyond else samples
-
-
-class _GatheredEpoch:
-    """
-    Gathers samples when their turn comes, so that images are not held twice.
-
-    :param buffer: A rollout buffer of SB3
-    :param indices: Of each minibatch, where its samples are in the buffer
-    """
-
-    def __init__(self, buffer: RolloutBuffer, indices: list[Any]):
-        self.sizes = [len(minibatch) for minibatch in indices]
-        self._buffer = buffer
-        self._indices = indices
-        self._epoch = np.concatenate(indices)
-
-    def minibatch(self, position: int) -> Any:
-        return self._buffer._get_samples(self._indices[position])
-
-    def observations(self, start: int, size: int) -> PyTorchObs:
-        """
-        :param start: Position in the epoch
-        :param size: Number of samples from there; the epoch's first follow its last
-        :return: Their observations
-        """
-        return self._buffer._get_samples(self._epoch.take(range(start, start + size), mode="wrap")).observations
-
-    def held(self) -> _HeldEpoch:
-        """
-        :return: The same epoch, gathered at once, which takes less time
-        """
-        everything = self._buffer._get_samples(self._epoch)
-        ends = np.cumsum(self.sizes).tolist()
-        parts = [slice(end - size, end) for end, size in zip(ends, self.sizes, strict=True)]
-        minibatches = [type(everything)(*(rows(each, part) for each in everything)) for part in parts]  # type: ignore[arg-type]
-        return _HeldEpoch(minibatches, everything.observations)
