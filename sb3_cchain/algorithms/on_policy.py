@@ -141,13 +141,14 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
             assert old is not None
             value_churns.append(mean_absolute_change(old, new.detach()))
 
-    def before_update(adders: Mapping[str, Callable[[], None]]) -> None:
+    adders: dict[str, Callable[[], None]] = {name: partial(hold_still, name) for name in reducers}
+
+    def before_update() -> None:
         with acting(), watching():
             for add_gradient in adders.values():
                 add_gradient()
 
     with ExitStack() as stack:
-        adders: dict[str, Callable[[], None]] = {name: partial(hold_still, name) for name in reducers}
         if options.churn_component != "full":
             backward = stack.enter_context(component_backward(list(policy.parameters()), options.churn_component))
             adders["policy"] = partial(hold_still, "policy", backward)
@@ -156,7 +157,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
         stack.enter_context(replaced(model.rollout_buffer, "get", references.get))
         logged = stack.enter_context(recorded(model.logger))
         surrogate = stack.enter_context(last_surrogate(model)) if options.churn_base_loss == "last" else None
-        stack.enter_context(extra_gradient(policy.optimizer, lambda: before_update(adders)))
+        stack.enter_context(extra_gradient(policy.optimizer, before_update))
         yield
 
     for name, reducer in reducers.items():
