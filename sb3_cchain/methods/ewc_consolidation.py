@@ -9,7 +9,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.methods.ewc import EWC
-from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.methods.optimizer_wrapper import nested_wrappers
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.model_optimizers import model_optimizers
@@ -77,13 +77,8 @@ class EWCConsolidation(TaskBoundary):
             self.model.ewc_task_start = 0  # type: ignore[union-attr]
 
     def _optimizers(self) -> list[EWC]:
-        found = []
-        for optimizer in model_optimizers(self.model).values():
-            while isinstance(optimizer, OptimizerWrapper) and not isinstance(optimizer, EWC):
-                optimizer = optimizer.base
-            if isinstance(optimizer, EWC):
-                found.append(optimizer)
-        return found
+        wrappers = [wrapper for each in model_optimizers(self.model).values() for wrapper in nested_wrappers(each)]
+        return [wrapper for wrapper in wrappers if isinstance(wrapper, EWC)]
 
     def _on_rollout_end(self) -> None:
         if isinstance(self.model, OnPolicyAlgorithm):  # the next rollout overwrites them

@@ -1,7 +1,7 @@
 """An optimiser that wraps another one."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import NoneType
 from typing import Any, ClassVar
 
@@ -57,11 +57,8 @@ class OptimizerWrapper(th.optim.Optimizer):
         if not isinstance(base_kwargs, (dict, NoneType)):
             raise TypeError(f"`base_kwargs` must be a dictionary, got {base_kwargs!r}")
         self.base: th.optim.Optimizer = base_class(params, lr=lr, **(base_kwargs or {}))  # type: ignore[call-arg]
-        inner = self.base
-        while isinstance(inner, OptimizerWrapper):
-            if inner.name == self.name:
-                raise ValueError(f"`base_class` must not contain another {type(self).__name__}, got {base_class.__name__}")
-            inner = inner.base
+        if any(wrapper.name == self.name for wrapper in nested_wrappers(self.base)):
+            raise ValueError(f"`base_class` must not contain another {type(self).__name__}, got {base_class.__name__}")
         # As `Optimizer.__init__`, which would also make new parameter groups and a new state
         self.__setstate__({})
 
@@ -171,3 +168,13 @@ class OptimizerWrapper(th.optim.Optimizer):
         if base_state:
             self.base.__setstate__(base_state)
             self._unshare()
+
+
+def nested_wrappers(optimizer: th.optim.Optimizer) -> Iterator[OptimizerWrapper]:
+    """
+    :param optimizer: An optimiser
+    :return: It and those inside of it, from the outside to the inside, as far as they are wrappers
+    """
+    while isinstance(optimizer, OptimizerWrapper):
+        yield optimizer
+        optimizer = optimizer.base
