@@ -5,6 +5,7 @@ import torch as th
 from sb3_cchain.analysis.health_figures import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
 from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.analysis.reference_batch import sample_batch
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.networks.model_optimizers import model_optimizers
@@ -96,7 +97,8 @@ class NetworkHealth(TrainingInterval):
 
     def _log(self) -> None:
         with unchanged_random_state():
-            health = network_health(self.model, self._sample_observations(self.batch_size), self.tau)
+            batch = sample_batch(self.model, self.batch_size)
+            health = network_health(self.model, batch["observations"], self.tau)
         for name, value in {**health, **self.gradient_norms()}.items():
             # The screen has no place for long names
             self.logger.record(f"health/{name}", value, exclude=("stdout", "log") if "/" in name else None)

@@ -1,18 +1,16 @@
-"""Callbacks that act at intervals of the training, on its data."""
+"""Callbacks that act at intervals of the training."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.analysis.reference_batch import sample_batch
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 
 
 class TrainingInterval(BaseCallback):
     """
-    Base of callbacks that act every ``interval`` and then look at data of the training.
+    Base of callbacks that act every ``interval``, on the data of the training.
 
     :param interval: Calls of ``train()`` for on-policy algorithms, gradient updates for off-policy ones; None for the
         defaults
@@ -63,11 +61,3 @@ class TrainingInterval(BaseCallback):
             return False
         is_first, self._has_looked = not self._has_looked, True
         return self._is_due() or is_first
-
-    def _sample_observations(self, batch_size: int) -> PyTorchObs:
-        """
-        Observations as the networks get them: on-policy of the rollout, without repetition and at most as many as it has;
-        off-policy of the replay buffer. Call it between the end of a rollout and the start of the next.
-        """
-        observations: PyTorchObs = sample_batch(self.model, batch_size)["observations"]
-        return observations

@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
+from sb3_cchain.analysis.reference_batch import sample_batch
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.methods.adam_rel import reset_step_count
 from sb3_cchain.methods.churn_reducers import forget_references
@@ -111,13 +112,13 @@ class IntervalRecycling(UnitRecycling, TrainingInterval):
     def _on_rollout_end(self) -> None:
         # The buffer is emptied between train() and the next rollout's start
         if isinstance(self.model, OnPolicyAlgorithm) and self._is_due():
-            self._observations = self._sample_observations(self.batch_size)
+            self._observations = sample_batch(self.model, self.batch_size)["observations"]
 
     def _on_rollout_start(self) -> None:
         # train() is over
         self.model.policy.set_training_mode(False)
         if isinstance(self.model, DQN) and self._is_due():
-            self._observations = self._sample_observations(self.batch_size)
+            self._observations = sample_batch(self.model, self.batch_size)["observations"]
         if self._observations is not None:
             self._recycle(self._observations)
             self._observations = None
