@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_cchain.methods.switch_or_interval import SwitchOrInterval
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.layers import LAYERS
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_bool, check_number
@@ -93,9 +94,7 @@ def trained_weights(policy: nn.Module) -> list[str]:
     return [
         f"{name}.weight"
         for name, module in policy.named_modules()
-        if isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d))
-        and module.weight.requires_grad
-        and not name.partition(".")[0].endswith("_target")
+        if isinstance(module, LAYERS) and module.weight.requires_grad and not name.partition(".")[0].endswith("_target")
     ]
 
 

@@ -11,6 +11,7 @@ from torch import nn
 from sb3_cchain.analysis.metrics.dormancy import mean_activity
 from sb3_cchain.networks.activations import ELEMENTWISE_ACTIVATIONS, CReLU, FourierFeatures
 from sb3_cchain.networks.forward_hooks import forward_hooks
+from sb3_cchain.networks.layers import LAYERS
 
 
 @dataclass
@@ -189,7 +190,7 @@ def hidden_activity(
 
 
 def _is_layer(module: nn.Module) -> TypeGuard[nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d]:
-    return isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)) and getattr(module, "groups", 1) == 1
+    return isinstance(module, LAYERS) and getattr(module, "groups", 1) == 1
 
 
 def _channel_dim(module: nn.Module) -> int:

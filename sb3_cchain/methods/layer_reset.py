@@ -9,6 +9,7 @@ from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.methods.plain_networks import check_plain_networks
 from sb3_cchain.methods.switch_or_interval import SwitchOrInterval
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.layers import LAYERS
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -92,7 +93,7 @@ def network_layers(policy: nn.Module) -> list[list[list[str]]]:
         layers: list[list[str]] = []
         for part in parts:
             for name, module in policy.get_submodule(part).named_modules(prefix=part):
-                if isinstance(module, (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)):
+                if isinstance(module, LAYERS):
                     layers.append([])
                 parameters = dict(module.named_parameters(recurse=False))
                 own = [key for key, parameter in parameters.items() if parameter.requires_grad]

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
-from torch import nn
 
 from sb3_cchain.networks.evaluation_mode import has_training_mode
+from sb3_cchain.networks.layers import CONVOLUTIONS
 from sb3_cchain.networks.policy_inputs import joined, n_observations
 from sb3_cchain.networks.policy_networks import PolicyNetworks, is_instrumented
 from sb3_cchain.networks.policy_outputs import distribution_of, has_own_distribution
@@ -44,7 +44,7 @@ def has_convolutions(policy: ActorCriticPolicy) -> bool:
     :param policy: An actor-critic policy
     :return: Whether it has convolutions, which take longer for two batches as one than for one after the other
     """
-    return any(isinstance(module, (nn.Conv1d, nn.Conv2d, nn.Conv3d)) for module in policy.modules())
+    return any(isinstance(module, CONVOLUTIONS) for module in policy.modules())
 
 
 def evaluate_jointly(
