@@ -109,7 +109,7 @@ class ChurnAlgorithm(ZeroRateWarning):
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
         self.churn_reducers = self._make_churn_reducers()
-        # `load()` puts in the state that was saved, as a dict, and calls `set_parameters()` next, which takes it
+        # `load()` has put in the saved state, a dict, which `set_parameters()` takes next
         if not isinstance(vars(self).get("churn_state"), dict):
             keep_churn_state(self, self.churn_reducers, self._task_switch)
 

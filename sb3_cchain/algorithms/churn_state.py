@@ -12,8 +12,8 @@ from sb3_cchain.tasks.signal import TaskSwitch
 class ChurnState:
     """
     Stands as ``churn_state`` among a model's attributes, which SB3 pickles into the saved file. There, and in a copy of the
-    model, it becomes a dict of tensors and numbers. A stock algorithm loads it as one more attribute and ignores it, without
-    this package, too.
+    model, it becomes a dict of tensors and numbers. A stock algorithm loads it as one more attribute and ignores it, also
+    where this package is not installed.
 
     :param model: The model
     :param reducers: Its churn reducers, by the name of the target

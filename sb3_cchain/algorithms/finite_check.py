@@ -27,7 +27,7 @@ class FiniteCheck(BaseCallback):
     def _on_rollout_start(self) -> None:
         if isinstance(self.model, OnPolicyAlgorithm):
             self._check_parameters()
-        # These are those of the last step, which were checked, unless the environments have been reset
+        # Those of the last step were checked then. Others are here where the environments have been reset since
         if self.model._last_obs is not self.locals.get("new_obs"):
             self._check_observations(self.model._last_obs)
 

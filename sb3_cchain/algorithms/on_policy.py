@@ -107,8 +107,8 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
     - ``churn/relative_loss``: λ·L_churn / \\|L\\|, which an adaptive λ holds near β
     - ``churn/policy_churn``: L_churn minus its value without any churn; for discrete actions the Kullback-Leibler
       divergence from the policy before an update to the one after it
-    - ``churn/value_churn``: mean absolute change of the state values by an update. Of a PPO that holds only its policy still,
-      by the first update of each epoch, unless no update follows it, on the first 32 samples of its reference batch
+    - ``churn/value_churn``: mean absolute change of the state values by an update. Where a PPO holds only its policy still, it
+      is that of the first update of each epoch, if another one follows it, on the first 32 samples of its reference batch
 
     With two targets, what belongs to one is logged as ``churn/policy/…`` or ``churn/value/…``. L is averaged over the updates.
     With ``churn_base_loss="last"``, L and ``churn/loss`` are those of the last update.
@@ -176,7 +176,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
 
 class _ValueWatch:
     """
-    Measures the churn of values that are not held still, by the first update of each epoch, unless no update follows it.
+    Measures the churn of values that are not held still: that of the first update of each epoch, if another one follows it.
 
     :param policy: The policy
     :param reducer: That of the policy's outputs

@@ -49,7 +49,7 @@ class ReferenceBatches:
     # minibatch is being trained on
     current: PyTorchObs | None = None
     starts_epoch: bool = False
-    # How many samples, the first ones, the minibatch and the reference batch of the one before have in common
+    # How many samples the minibatch shares with the reference batch of the minibatch before: the first ones of both
     n_shared: int
 
     def __init__(self, buffer: RolloutBuffer, kind: str = "independent", size: float = 1.0):

@@ -1,4 +1,4 @@
-"""What stands in the place of an object's methods for a while. The blocks may end in any order."""
+"""Wrappers around an object's methods, each for the time of a ``with`` block. The blocks may end in any order."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext

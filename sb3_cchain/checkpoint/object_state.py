@@ -130,8 +130,8 @@ def object_states(
     :param holders: Objects by names. What several of them refer to is still one object when their states are put back
     :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the states are put back
     :param skip: For each holder the names of its attributes that are not part of its state
-    :param strict: Names of the holders of which all that they refer to is part of their state. Of the others, plain data and
-        tensors are, and objects whose class comes from this package, or from one that a class of the holder comes from
+    :param strict: Names of the holders whose state is all that they refer to. That of the others is plain data, tensors, and
+        objects whose class comes from this package, or from a package of the holder's class or of its bases
     :param left_out: Takes the names of what is not part of the states of the others, as ``holder.attribute.attribute``
     :return: The state of each
     :raises NotSaved: For an attribute of a ``strict`` holder that cannot be saved

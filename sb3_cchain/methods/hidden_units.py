@@ -26,7 +26,7 @@ class HiddenUnits:
     :param n_units: Number of units
     :param outgoing: The layers that the units feed, with their sources
     :param norms: The LayerNorms between, with the sources of their parameters
-    :param has_weights: Whether ``layer`` is a module, of which each unit has incoming weights of its own
+    :param has_weights: Whether ``layer`` names a module, in which each unit has incoming weights of its own
     """
 
     layer: str

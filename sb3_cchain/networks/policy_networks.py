@@ -72,7 +72,7 @@ class PlainNetworks(PolicyNetworks):
 
     def __init__(self, policy: ActorCriticPolicy):
         super().__init__(policy)
-        # Where PyTorch keeps the modules. They may be put in place in the middle of a rollout
+        # PyTorch's own dictionary, because its modules may be replaced in the middle of a rollout
         self._modules: dict[str, Any] = policy._modules
 
     def actor_features(self, observations: PyTorchObs) -> th.Tensor:
@@ -149,6 +149,6 @@ def is_plain(policy: nn.Module) -> bool:
 def networks_of(policy: ActorCriticPolicy) -> PolicyNetworks:
     """
     :param policy: An actor-critic policy that extracts features as SB3's do
-    :return: Its networks, for as long as no module is put in place and no hook is registered
+    :return: Its networks, which are right for as long as no module is replaced and no hook is registered
     """
     return PlainNetworks(policy) if is_plain(policy) else PolicyNetworks(policy)

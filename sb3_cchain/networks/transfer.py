@@ -39,9 +39,9 @@ def transfer(model: BaseAlgorithm, env: GymEnv | str, new_heads: bool = True) ->
     as after ``set_env()``.
 
     Layers whose shape stays are kept, with the optimiser's state of their parameters (Adam's moments and step counts). All
-    others are drawn anew, as a whole: a layer whose weights do not fit gets a new bias, too. That are the first layers where
-    observations differ, and the heads: the last layers, of actions, values and action values, and the standard deviation of
-    continuous actions. In DQN the same goes for the target network.
+    others are drawn anew, as a whole: a layer whose weights do not fit gets a new bias, too. Those are the first layers, if
+    the observations differ, and the heads: the last layers, of actions, values and action values, and the standard deviation
+    of continuous actions. In DQN the same goes for the target network.
 
     The model stays the same object. Its counters and schedules go on. Buffers are new and empty: DQN trains on few
     transitions at first. C-CHAIN starts over, with λ's history and its reference batch, and so does what optimiser wrappers
