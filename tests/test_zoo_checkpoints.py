@@ -16,7 +16,7 @@ from sb3_cchain import CChainPPO, DoubleDQN
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.checkpoint import resumable_env, saved_timesteps
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
-from sb3_cchain.zoo.checkpoint_options import plain
+from sb3_cchain.zoo.training_record import plain
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
 
 ENV = "Continual/CartPole-v1"

@@ -1,7 +1,6 @@
 """The options of ``sb3-cchain train`` that RL Zoo does not have: checkpoints, and training that goes on exactly from one."""
 
 import argparse
-import json
 import re
 import shlex
 import sys
@@ -10,26 +9,18 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from sb3_cchain.checkpoint import write_safely
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint
+from sb3_cchain.zoo.training_record import COMMAND, read_record
 
 # In a run folder
 CHECKPOINTS = "checkpoints"
 RESUMED_FROM = "resumed_from"
-# Beside the checkpoints: what the training was started with
-COMMAND = "command.json"
 
 # Checkpoints that stay
 KEEP = 2
 
 # In the place of a path after --resume
 LAST = Path("last")
-
-# Options of RL Zoo that training depends on, and evaluations, which draw random numbers
-COMPARED = (
-    *("algo", "env", "seed", "env_kwargs", "eval_env_kwargs", "vec_env", "eval_freq", "eval_episodes", "n_eval_envs"),
-    *("save_freq", "log_interval", "progress"),  # callbacks must be the same, and logs go on
-)
 
 
 class CheckpointOptions(NamedTuple):
@@ -42,7 +33,7 @@ class CheckpointOptions(NamedTuple):
     :param typed: The other arguments, as typed
     :param resume: Where the checkpoint is that training goes on from, None for training from the start
     :param checkpoint: That checkpoint
-    :param record: What that training was started with, see :func:`write_record`
+    :param record: What that training was started with, see :func:`~sb3_cchain.zoo.training_record.write_record`
     """
 
     freq: int | None
@@ -192,74 +183,3 @@ def _where_to_look(resume: Path) -> Path:
     if not has_checkpoint(inside) and resumed_from.is_file():
         return Path(resumed_from.read_text().strip())
     return inside if inside.is_dir() else resume
-
-
-def write_record(
-    folder: Path, options: CheckpointOptions, args: argparse.Namespace, hyperparameters: Mapping[str, Any]
-) -> None:
-    """
-    Write beside the checkpoints what the training is started with, so that training that goes on can be compared with it.
-
-    :param folder: Folder of the checkpoints
-    :param options: The options
-    :param args: RL Zoo's
-    :param hyperparameters: As RL Zoo read them
-    """
-    record = {
-        "checkpoint_freq": options.freq,
-        "checkpoint_keep": options.keep,
-        "options": {name: plain(getattr(args, name)) for name in COMPARED},
-        "hyperparameters": plain(hyperparameters),
-    }
-    with write_safely(folder / COMMAND) as path:
-        path.write_text(json.dumps(record, indent=1) + "\n")
-
-
-def read_record(folder: Path) -> dict[str, Any]:
-    """
-    :param folder: Folder of the checkpoints
-    :return: What :func:`write_record` wrote there
-    :raises ValueError: When there is no such file
-    """
-    try:
-        return json.loads((folder / COMMAND).read_text())
-    except FileNotFoundError:
-        raise ValueError(
-            f"the checkpoints in {folder} were not made by `sb3-cchain train`, which writes {COMMAND} beside them: go on in "
-            "Python, by sb3_cchain.resume()"
-        ) from None
-
-
-def differences(record: Mapping[str, Any], args: argparse.Namespace, hyperparameters: Mapping[str, Any]) -> list[str]:
-    """
-    :param record: What training was started with
-    :param args: RL Zoo's, of training that is to go on
-    :param hyperparameters: As RL Zoo read them, of training that is to go on. Their ``n_timesteps`` may differ
-    :return: What differs, in a few words each
-    """
-    found = []
-    for name in COMPARED:
-        before, now = record["options"][name], plain(getattr(args, name))
-        if before != now:
-            found.append(f"--{name.replace('_', '-')} {before}, not {now}")
-    before, now = record["hyperparameters"], plain(hyperparameters)
-    for name in sorted({*before, *now} - {"n_timesteps"}):
-        if before.get(name) != now.get(name):
-            found.append(f"{name} {before.get(name)}, not {now.get(name)}")
-    return found
-
-
-def plain(value: Any) -> Any:
-    """
-    :param value: An option or hyperparameters
-    :return: The same as JSON holds it; classes, functions and objects that do not describe themselves by their names
-    """
-    return json.loads(json.dumps(value, default=_name))
-
-
-def _name(value: Any) -> str:
-    if hasattr(value, "__qualname__"):
-        return value.__qualname__
-    kind = type(value)
-    describes_itself = kind.__str__ is not object.__str__ or kind.__repr__ is not object.__repr__
-    return str(value) if describes_itself else kind.__qualname__

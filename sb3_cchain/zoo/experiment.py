@@ -37,10 +37,11 @@ from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
-from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, differences, plain, write_record
+from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
 from sb3_cchain.zoo.statistics import statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
+from sb3_cchain.zoo.training_record import differences, plain, write_record
 
 
 class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -128,7 +129,8 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
         if self.checkpoints is not None:
-            write_record(self.checkpoint_folder, self.checkpoints, self.args, self._hyperparameters_read)
+            freq, keep = self.checkpoints.freq, self.checkpoints.keep
+            write_record(self.checkpoint_folder, freq, keep, self.args, self._hyperparameters_read)
         if self.resumed is not None:
             (Path(self.save_path) / RESUMED_FROM).write_text(f"{self.resumed.path.resolve()}\n")
             self._copy_best(self.resumed.folder.parent)
