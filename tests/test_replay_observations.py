@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import DQN, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_cchain import CChainCallback
 from sb3_cchain.algorithms.replay_observations import sample_observations
+from sb3_cchain.analysis import ChurnMonitor
+from sb3_cchain.analysis.ntk import q_ntk
+from sb3_cchain.analysis.reference_batch import sample_batch
 from tests.churn_models import DICT
 from tests.envs import RandomEnv
 
@@ -30,6 +34,14 @@ class NegatingBuffer(ReplayBuffer):
     def _get_samples(self, batch_inds, env=None):
         samples = super()._get_samples(batch_inds, env)
         return samples._replace(observations=-samples.observations)
+
+
+class RememberingBuffer(ReplayBuffer):
+    """Knows what it drew last, as one with priorities does, which follow the losses of those transitions."""
+
+    def sample(self, batch_size, env=None):
+        self.last_drawn = np.random.randint(self.size(), size=batch_size)
+        return self._get_samples(self.last_drawn, env)
 
 
 CompactBuffer = partial(ReplayBuffer, optimize_memory_usage=True, handle_timeout_termination=False)
@@ -130,3 +142,31 @@ def test_a_method_of_the_buffer_that_was_replaced_is_called(method, monkeypatch)
     monkeypatch.setattr(buffer, method, replacement)
     assert len(sample_observations(buffer, 16, None)) == 16
     assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    "draw_beside_training",
+    [lambda model: sample_observations(model.replay_buffer, 8, None), lambda model: sample_batch(model, 8), q_ntk],
+)
+def test_the_buffer_of_training_is_left_as_it_is(draw_beside_training):
+    model = DQN("MlpPolicy", "CartPole-v1", replay_buffer_class=RememberingBuffer, device="cpu", seed=0)
+    model.learn(20)
+    model.replay_buffer.sample(16)
+    before = dict(vars(model.replay_buffer))
+    assert draw_beside_training(model) is not None
+    assert all(vars(model.replay_buffer)[name] is value for name, value in before.items())
+    assert len(vars(model.replay_buffer)) == len(before)
+
+
+@pytest.mark.parametrize("callback", [CChainCallback(), ChurnMonitor(interval=1, batch_size=8)])
+def test_training_alone_draws_from_its_buffer(callback):
+    drawn_from = []
+
+    class Buffer(RememberingBuffer):
+        def sample(self, batch_size, env=None):
+            drawn_from.append(self)
+            return super().sample(batch_size, env)
+
+    model = DQN("MlpPolicy", "CartPole-v1", replay_buffer_class=Buffer, learning_starts=8, device="cpu", seed=0)
+    model.learn(40, callback)
+    assert sum(buffer is model.replay_buffer for buffer in drawn_from) == model._n_updates < len(drawn_from)

@@ -1,7 +1,7 @@
 """Draws observations from a replay buffer, and actions, for a batch that needs no rewards or next observations."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -10,17 +10,30 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.replaced import replaced
 
+BufferT = TypeVar("BufferT", bound=ReplayBuffer)
+
 # How SB3's replay buffers draw transitions, and how they gather those that were drawn. HerReplayBuffer does otherwise
 _DRAWS = (ReplayBuffer.sample, DictReplayBuffer.sample)
 _GATHERS = (ReplayBuffer._get_samples, DictReplayBuffer._get_samples, NStepReplayBuffer._get_samples)
+
+
+def beside_training(buffer: BufferT) -> BufferT:
+    """
+    :param buffer: The replay buffer of a model that is being trained
+    :return: Another buffer with the same data, to draw from for other ends than training. What a buffer sets in itself when it
+        is drawn from, such as the indices whose priorities follow the losses, stays as the training left it.
+    """
+    other = object.__new__(type(buffer))
+    vars(other).update(vars(buffer))
+    return other
 
 
 def sample_observations(
     buffer: ReplayBuffer, batch_size: int, env: VecNormalize | None, with_actions: bool = False
 ) -> Observations:
     """
-    Draw what ``buffer.sample(batch_size, env).observations`` would be, from the same random numbers. The rest of the
-    transitions is not gathered, except from a buffer that does not draw or gather them as SB3's own do.
+    Draw what ``buffer.sample(batch_size, env).observations`` would be, from the same random numbers, and leave the buffer as
+    it is. The rest of the transitions is not gathered, except from a buffer that does not draw or gather them as SB3's own do.
 
     :param buffer: A replay buffer
     :param batch_size: Number of observations
@@ -28,6 +41,7 @@ def sample_observations(
     :param with_actions: Whether the actions are drawn, too
     :return: The observations; with actions ``observations`` and ``actions``
     """
+    buffer = beside_training(buffer)
     if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS):
         samples: Any = buffer.sample(batch_size, env=env)
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
