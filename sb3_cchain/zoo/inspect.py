@@ -141,7 +141,7 @@ def main(arguments: Sequence[str]) -> int:
         written = _write(args, inspections)
     except OSError as error:
         parser.error(f"{error.filename}: {error.strerror}")
-    console.print(f"Written: {', '.join(map(str, written))}", soft_wrap=True)
+    print_line(console, f"Written: {', '.join(map(str, written))}")
     fails = CERTAINTIES[: CERTAINTIES.index(args.fail_on) + 1] if args.fail_on != "never" else ()
     code = 3 if any(finding.check.certainty in fails for inspection in inspections for finding in inspection.findings) else 0
     if args.json:
@@ -172,9 +172,9 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
     if args.task is not None:
         _forget_task(model, callbacks)
     if model.lr_schedule(model._current_progress_remaining) == 0:
-        console.print(f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
+        print_line(console, f"{name} was saved when its learning rate had come down to 0: its updates change nothing.")
     model.set_random_seed(args.seed)
-    console.print(f"{name}: {path}, {type(model).__name__}, {model.num_timesteps} steps of training", soft_wrap=True)
+    print_line(console, f"{name}: {path}, {type(model).__name__}, {model.num_timesteps} steps of training")
     inspection = inspect_model(model, name, args.n_steps, args.n_updates, callbacks)
     assert model.env is not None
     model.env.close()
