@@ -252,6 +252,30 @@ def test_extra_gradients_nest_and_survive_errors():
     assert "zero_grad" not in vars(optimizer)
 
 
+def test_a_warning_says_that_no_gradient_was_added():
+    network = make_network()
+    optimizer = th.optim.Adam(network.parameters())
+    with (
+        pytest.warns(UserWarning, match="without a call of the optimiser's `zero_grad"),
+        extra_gradient(optimizer, lambda: None),
+    ):
+        network.zero_grad()
+        network(th.ones(1, 3)).sum().backward()
+        optimizer.step()
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_warning_where_there_was_no_update():
+    optimizer = th.optim.Adam(make_network().parameters())
+    with extra_gradient(optimizer, lambda: None):
+        pass
+    optimizer.step()
+    with pytest.raises(RuntimeError), extra_gradient(optimizer, lambda: None):
+        optimizer.step()
+        raise RuntimeError
+    assert not optimizer._optimizer_step_post_hooks
+
+
 def test_reducer_standalone_against_written_out_loss():
     """The loop of the class's docstring, against one that keeps a copy of the network."""
     import copy

@@ -1,5 +1,6 @@
 """Adds a loss, or a gradient, to every update of a training loop that cannot be changed."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,17 +21,34 @@ def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], object]
 
     The blocks nest, the innermost one running last; nothing stays patched afterwards.
 
-    :param optimizer: The optimiser whose loop runs ``zero_grad → loss.backward → (clip) → step``
+    :param optimizer: The optimiser whose loop runs ``zero_grad → loss.backward → (clip) → step``. Of several optimisers, the
+        one whose ``zero_grad()`` comes last: those that follow clear the gradients of their parameters again.
     :param backward: Adds its gradient to the parameters' ``.grad``, for instance ``lambda: extra_loss().backward()``
     """
     zero_grad = optimizer.zero_grad
+    n_calls = n_updates = 0
 
     def zero_grad_and_backward(*args: Any, **kwargs: Any) -> None:
+        nonlocal n_calls
+        n_calls += 1
         zero_grad(*args, **kwargs)
         backward()
 
-    with replaced(optimizer, "zero_grad", zero_grad_and_backward):
-        yield
+    def count_update(*_: Any) -> None:
+        nonlocal n_updates
+        n_updates += 1
+
+    counting = optimizer.register_step_post_hook(count_update)
+    try:
+        with replaced(optimizer, "zero_grad", zero_grad_and_backward):
+            yield
+    finally:
+        counting.remove()
+    if n_updates > 0 and n_calls == 0:
+        warnings.warn(
+            "Updates were made without a call of the optimiser's `zero_grad()`, so churn was not reduced. Call it before each "
+            "`backward()`, and not the network's `zero_grad()`."
+        )
 
 
 def carrying(tensor: th.Tensor, loss: th.Tensor, coef: float = 1.0) -> th.Tensor:

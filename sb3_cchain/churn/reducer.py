@@ -128,7 +128,8 @@ class ChurnReducer(nn.Module):
         """
         Keep the present outputs on ``reference`` for the next update.
 
-        :param reference: Observations outside the minibatch of the update that is about to be made
+        :param reference: Observations outside the minibatch of the update that is about to be made. They are kept as they are,
+            not copied: do not change them in place
         :param outputs: The outputs, without gradient, where the training loop has them
         :raises ValueError: When the reference batch is empty
         """
