@@ -58,7 +58,10 @@ class OptimizerWrapper(th.optim.Optimizer):
             raise TypeError(f"`base_kwargs` must be a dictionary, got {base_kwargs!r}")
         self.base: th.optim.Optimizer = base_class(params, lr=lr, **(base_kwargs or {}))  # type: ignore[call-arg]
         if any(wrapper.name == self.name for wrapper in nested_wrappers(self.base)):
-            raise ValueError(f"`base_class` must not contain another {type(self).__name__}, got {base_class.__name__}")
+            raise ValueError(
+                f"`base_class` must not contain another {type(self).__name__}, got {base_class.__name__}. (They are told "
+                f"apart by `name`, here {self.name!r}: give each class of your own another one.)"
+            )
         # As `Optimizer.__init__`, which would also make new parameter groups and a new state
         self.__setstate__({})
 
