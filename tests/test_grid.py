@@ -631,18 +631,22 @@ def test_a_failed_run_says_why(trained):
 
 
 @pytest.mark.parametrize(
-    "suite, env_id, method, names, overrides",
+    "suite, env_id, method, names, changes",
     [
         pytest.param(
-            *("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"], ["n_epochs:1"]), marks=needs_procgen
+            *("procgen", "Continual/Starpilot-v0", "vanilla", ["level 20", "level 21"]),
+            # One rollout holds both tasks, and an episode of each
+            dict(steps_per_task=120, overrides=("n_steps:240", "batch_size:80", "n_epochs:1")),
+            marks=needs_procgen,
         ),
-        ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"], []),
+        ("minatar", "Continual/MinAtar-v0", "cchain", ["SpaceInvaders", "Asterix"], {}),
     ],
 )
-def test_runs_of_the_other_suites(suite, env_id, method, names, overrides, tmp_path):
+def test_runs_of_the_other_suites(suite, env_id, method, names, changes, tmp_path):
     (run,) = grid_runs([suite], [env_id], [method], budget="smoke")
-    (result,), failures = train([replace(run, overrides=tuple(overrides))], tmp_path)
-    assert failures == [] and find_result(replace(run, overrides=tuple(overrides)), tmp_path / "results") == result
+    run = replace(run, **changes)
+    (result,), failures = train([run], tmp_path)
+    assert failures == [] and find_result(run, tmp_path / "results") == result
     assert result.task_names == names
     rows = result.returns
     if suite == "minatar":
