@@ -74,9 +74,13 @@ def written_out_ppo(churn_reference, churn_batch_size):
     return WithReferences
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-@pytest.mark.parametrize("max_grad_norm", [0.5, 0.05])
-@pytest.mark.parametrize("target_kl", [None, 0.0005])
+@pytest.mark.parametrize(
+    "env_id, max_grad_norm, target_kl",
+    [  # all pairs of two
+        *(("CartPole-v1", *others) for others in ((0.5, None), (0.05, 0.0005))),
+        *(("Pendulum-v1", *others) for others in ((0.5, 0.0005), (0.05, None))),
+    ],
+)
 def test_ppo_equals_sb3_source_with_the_term_in_its_loss(env_id, max_grad_norm, target_kl, monkeypatch):
     monkeypatch.setattr(on_policy, "can_evaluate_jointly", lambda policy: False)
     settings = dict(PPO_SETTINGS, max_grad_norm=max_grad_norm, target_kl=target_kl)
@@ -209,10 +213,15 @@ def test_double_dqn_equals_sb3_source_with_other_targets_and_loss(double_q, loss
     assert differ(model, without_churn_reduction(DQN, n_steps=n_steps))
 
 
-@pytest.mark.parametrize("own_pass", [False, True])
-@pytest.mark.parametrize("max_grad_norm", [10, 0.05])
-@pytest.mark.parametrize("double_q, loss", [(True, "mse"), (False, "huber")])
-@pytest.mark.parametrize("churn_reference", REFERENCES)
+@pytest.mark.parametrize(
+    "double_q, loss, max_grad_norm, own_pass, churn_reference",
+    [  # all combinations of any three of: the targets with their loss, the norm, the pass, the reference
+        (double_q, loss, max_grad_norm, own_pass, REFERENCES[double_q ^ (max_grad_norm == 10) ^ own_pass])
+        for double_q, loss in ((True, "mse"), (False, "huber"))
+        for max_grad_norm in (10, 0.05)
+        for own_pass in (False, True)
+    ],
+)
 def test_dqn_equals_sb3_source_with_the_term_in_its_loss(
     double_q, loss, max_grad_norm, own_pass, churn_reference, monkeypatch
 ):
