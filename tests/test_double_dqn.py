@@ -110,9 +110,14 @@ def other_settings(name):
     }[name]
 
 
-@pytest.mark.parametrize("double_q", [False, True])
-@pytest.mark.parametrize("name", ["Box", "Dict", "VecNormalize", "HER"])
-@each_reference
+@pytest.mark.parametrize(
+    "name, double_q, churn_reference",
+    [  # all pairs of two
+        (name, double_q, REFERENCES[double_q ^ number % 2])
+        for number, name in enumerate(["Box", "Dict", "VecNormalize", "HER"])
+        for double_q in (False, True)
+    ],
+)
 def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, churn_reference, monkeypatch):
     models = []
     settings = dict(double_q=double_q, churn_coef=10.0, gradient_steps=2, churn_reference=churn_reference)
