@@ -91,6 +91,7 @@ each_target = pytest.mark.parametrize(
     [pytest.param(member, target, id=f"{name}-{target}") for name, member in FAMILY.items() for target in member.targets],
 )
 N_STEPS = 100
+FEW_STEPS = 60  # two rollouts, or 40 updates
 
 
 def logged(model):
@@ -119,7 +120,7 @@ def test_with_a_coefficient_of_0_it_is_its_base(member):
 
 @each_target
 def test_trains_and_logs(member, target):
-    model = learn(member.make(churn_target=target))
+    model = learn(member.make(churn_target=target), FEW_STEPS)
     targets = ("policy", "value") if target == "both" else (target,)
     expected = {f"churn/{name}_churn" for name in targets}
     for name in targets:
@@ -255,11 +256,11 @@ def written_out(member):
 @pytest.mark.parametrize("name", SOURCES)
 def test_equals_the_source_of_the_base_with_the_term_in_its_loss(name):
     member = FAMILY[name]
-    reference = learn(member.make(written_out(member)))
-    model = learn(member.make(churn_target=member.targets[-1], churn_coef=COEF))
+    reference = learn(member.make(written_out(member)), FEW_STEPS)
+    model = learn(member.make(churn_target=member.targets[-1], churn_coef=COEF), FEW_STEPS)
     assert reference.n_terms > 10
     assert_close(reference, model, atol=1e-5)
-    stock = learn(member.make(member.stock))
+    stock = learn(member.make(member.stock), FEW_STEPS)
     largest = max(
         (p - q).abs().max().item() for p, q in zip(stock.policy.parameters(), model.policy.parameters(), strict=True)
     )
@@ -504,7 +505,7 @@ def expected_base_loss(member, target, logged, model):
 @each_target
 def test_lambda_compares_with_the_loss_that_was_logged(member, target):
     of_actor_critic = dict(ent_coef=0.3, vf_coef=0.7) if member.name in ("PPO", "A2C", "MaskablePPO", "RecurrentPPO") else {}
-    model = learn(member.make(churn_target=target, churn_warmup=0, churn_window=1, **of_actor_critic))
+    model = learn(member.make(churn_target=target, churn_warmup=0, churn_window=1, **of_actor_critic), FEW_STEPS)
     for name, reducer in model.churn_reducers.items():
         expected = abs(expected_base_loss(member, name, model.logger.name_to_value, model))
         assert reducer.coefficient.base_losses.item() == pytest.approx(expected, rel=1e-5), name
