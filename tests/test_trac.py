@@ -12,7 +12,7 @@ from trac_optimizer.trac import erfi as erfi_of_package
 from sb3_cchain.methods import TRAC
 from sb3_cchain.methods.trac import erfi
 
-N_STEPS = 200
+N_STEPS = 100
 BASES = [(th.optim.Adam, dict(eps=1e-5)), (th.optim.SGD, dict(momentum=0.9))]
 
 
@@ -75,7 +75,7 @@ def test_each_update_equals_the_packages(tmp_path, double_precision, max_grad_no
 
 @pytest.mark.parametrize("max_grad_norm, new_lr", [(None, None), (0.4, 3e-3)])
 @pytest.mark.parametrize("base, kwargs", BASES)
-def test_200_updates_equal_the_packages(tmp_path, monkeypatch, double_precision, max_grad_norm, new_lr, base, kwargs):
+def test_100_updates_equal_the_packages(tmp_path, monkeypatch, double_precision, max_grad_norm, new_lr, base, kwargs):
     """Left to itself, with erfi's coefficients in double precision, too, which the package computes when it is imported."""
     monkeypatch.setattr(trac_optimizer.trac, "erf_torch", trac_optimizer.trac.ERF_1994(128))
     generator = th.Generator().manual_seed(0)
