@@ -13,6 +13,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
@@ -309,9 +310,11 @@ def _major(version_number: str) -> int:
     return int(version_number.partition(".")[0])
 
 
-def package_versions() -> dict[str, str]:
+@cache
+def package_versions() -> Mapping[str, str]:
     """
-    :return: The versions that a checkpoint names
+    :return: The versions that a checkpoint names. They are looked up once, for reading the metadata of a package takes longer
+        than writing a small checkpoint
     """
     found = {"python": python_version()}
     for name in PACKAGES:
