@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TransformReward
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
@@ -22,6 +22,7 @@ from sb3_cchain.networks.extractors import MinAtarCNN
 from tests.churn_models import (
     DICT,
     FORMS,
+    GenerousBuffer,
     NormalisedExtractor,
     assert_churn_was_reduced,
     churn_keys,
@@ -128,13 +129,6 @@ def test_reference_batches_with_the_minibatch_or_on_their_own(name, double_q, ch
         assert th.allclose(p, q, rtol=0, atol=1e-5)
     together, alone = (model.logger.name_to_value for model in models)
     assert all(together[key] == pytest.approx(alone[key], rel=1e-2) for key in churn_keys(models[0]))
-
-
-class GenerousBuffer(ReplayBuffer):
-    """Twice as many samples as it is asked for."""
-
-    def sample(self, batch_size, env=None):
-        return super().sample(2 * batch_size, env)
 
 
 @pytest.mark.parametrize("double_q", [False, True])

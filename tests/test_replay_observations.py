@@ -17,15 +17,8 @@ from sb3_cchain.algorithms.replay_observations import sample_observations
 from sb3_cchain.analysis import ChurnMonitor
 from sb3_cchain.analysis.ntk import q_ntk
 from sb3_cchain.analysis.reference_batch import sample_batch
-from tests.churn_models import DICT
+from tests.churn_models import DICT, GenerousBuffer
 from tests.envs import RandomEnv
-
-
-class GenerousBuffer(ReplayBuffer):
-    """Twice as many samples as it is asked for."""
-
-    def sample(self, batch_size, env=None):
-        return super().sample(2 * batch_size, env)
 
 
 class NegatingBuffer(ReplayBuffer):
