@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from unittest.mock import Mock, patch
 
@@ -13,12 +14,12 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
-from stable_baselines3.common.utils import set_random_seed
 from torch import nn
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO
 from sb3_cchain.algorithms.churn_state import ChurnState
 from sb3_cchain.networks import evaluation_mode
+from tests import method_models
 from tests.envs import RandomEnv
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -160,10 +161,5 @@ def state_of(model):
     return [tensor.clone() for tensor in (*model.policy.state_dict().values(), *coefficient.values())]
 
 
-def go_on(model, callback=None):
-    """From the same random numbers and the same first observation."""
-    set_random_seed(7)
-    model.env.seed(7)
-    model.action_space.seed(7)
-    model._last_obs = None
-    return model.learn(40, callback, reset_num_timesteps=False)
+# Two rollouts
+go_on = partial(method_models.go_on, n_steps=40)

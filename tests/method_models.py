@@ -60,13 +60,13 @@ def parameters(model):
     return {name: parameter.detach().clone() for name, parameter in model.policy.named_parameters()}
 
 
-def go_on(model, callback):
+def go_on(model, callback=None, n_steps=32):
     """From the same random numbers and the same first observation."""
     set_random_seed(7)
     model.env.seed(7)
     model.action_space.seed(7)
     model._last_obs = None
-    return model.learn(32, callback=callback, reset_num_timesteps=False)
+    return model.learn(n_steps, callback=callback, reset_num_timesteps=False)
 
 
 def optimizer_arguments(method):
