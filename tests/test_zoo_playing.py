@@ -15,7 +15,7 @@ from sb3_cchain import ContinualEnv, TaskSync
 from sb3_cchain.analysis import EvalTrainedTask
 from sb3_cchain.zoo.as_trained import make_as_trained
 from sb3_cchain.zoo.playing import Playing
-from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
+from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command, search_short_rollouts
 
 
 class OneAllowed(gym.Env):
@@ -62,7 +62,8 @@ def test_maskable_ppo_is_evaluated_and_played_with_masks(tmp_path):
     enjoy(tmp_path)
 
 
-def test_the_search_evaluates_with_masks(tmp_path):
+def test_the_search_evaluates_with_masks(tmp_path, monkeypatch):
+    search_short_rollouts(monkeypatch, MaskablePPO)
     evaluation = ("--eval-episodes", 1, "--n-evaluations", 1)
     train(tmp_path, "-optimize", "--n-trials", 1, "--n-startup-trials", 1, evaluation=evaluation, n=32)
 

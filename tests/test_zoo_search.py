@@ -17,7 +17,7 @@ from sb3_cchain.algorithms.churn_targets import KINDS
 from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
 from sb3_cchain.zoo.search import _BETAS
-from tests.zoo_command import FAST, NO_EVALUATION, command
+from tests.zoo_command import FAST, NO_EVALUATION, command, search_short_rollouts
 
 OPTIMIZE = ("-optimize", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots", "--seed", "1")
 
@@ -29,9 +29,7 @@ def read_report(folder):
 
 
 def test_beta_is_searched_for_ppo_cchain(tmp_path, monkeypatch):
-    # RL Zoo's space for PPO has long rollouts and large networks
-    _, converter = search._SEARCH_SPACES[PPO]
-    monkeypatch.setitem(search._SEARCH_SPACES, PPO, (lambda *_: dict(n_steps=50, batch_size=25), converter))
+    search_short_rollouts(monkeypatch, PPO)
     command(
         *("train", "--algo", "ppo_cchain", "--env", "Continual/CartPole-v1", "-n", "100", "-f", tmp_path, *FAST),
         *(*OPTIMIZE, "--n-trials", "2"),

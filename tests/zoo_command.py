@@ -11,6 +11,7 @@ import rl_zoo3.train
 import yaml
 
 import sb3_cchain.zoo.__main__ as zoo
+import sb3_cchain.zoo.search as search
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.zoo.settings import read_settings
 
@@ -45,6 +46,12 @@ def run(*command, cwd, ok=True):
     result = subprocess.run([sys.executable, "-m", *command], cwd=cwd, capture_output=True, text=True, env=environment)
     assert (result.returncode == 0) == ok, result.stdout + result.stderr
     return result.stdout + result.stderr
+
+
+def search_short_rollouts(monkeypatch, algorithm):
+    """RL Zoo's search space for PPO has long rollouts and large networks."""
+    _, converter = search._SEARCH_SPACES[algorithm]
+    monkeypatch.setitem(search._SEARCH_SPACES, algorithm, (lambda *_: dict(n_steps=50, batch_size=25), converter))
 
 
 def shipped_settings(algo):
