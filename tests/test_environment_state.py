@@ -1,9 +1,7 @@
 """The state of environments is put back into new ones, which go on as the old ones would have."""
 
 import pickle
-import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -41,8 +39,8 @@ from sb3_cchain.checkpoint.simulator_state import emptied, register_simulators
 from sb3_cchain.checkpoint.training_description import describe_env
 from sb3_cchain.envs import ContinualProcgenVecEnv, TaskVecNormalize
 from tests.envs import CountEnv, RandomEnv
+from tests.resume_cases import in_new_process
 
-ROOT = Path(__file__).parent.parent
 # Steps of each environment after which the next task begins
 TASK_STEPS = 60
 # Environment, its arguments, how many of them, and the package that it needs
@@ -185,27 +183,24 @@ def test_goes_on_exactly_in_processes_of_their_own(env_id):
 IN_NEW_PROCESS = ("Continual/LunarLander-v3", "BipedalWalker-v3", "HalfCheetah-v5", "ContinualProcgenVecEnv")
 
 
-def test_goes_on_exactly_in_a_new_process(tmp_path):
+def test_goes_on_exactly_in_a_new_process():
     expected, states = {}, {}
     for env_id in IN_NEW_PROCESS:
         history, saved = play_and_save(make(env_id), [100], 180)
         expected[env_id], states[env_id] = history[100:], saved[100]
-    (tmp_path / "states").write_bytes(pickle.dumps(states))
-    code = f"from tests import test_environment_state; test_environment_state.go_on_from({str(tmp_path)!r})"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-    found = pickle.loads((tmp_path / "found").read_bytes())
+    found = in_new_process(go_on_from, pickle.dumps(states))
     for env_id in IN_NEW_PROCESS:
         assert_same(expected[env_id], found[env_id])
 
 
-def go_on_from(folder):
+def go_on_from(states):
     """In the new process."""
     found = {}
-    for env_id, state in pickle.loads((Path(folder) / "states").read_bytes()).items():
+    for env_id, state in pickle.loads(states).items():
         env = make(env_id, seed=7)
         restore_environment(env, pickle.loads(state))
         found[env_id] = play(env, range(100, 180))
-    (Path(folder) / "found").write_bytes(pickle.dumps(found))
+    return found
 
 
 class Squares(VecEnvWrapper):

@@ -1,7 +1,6 @@
 """Continual metrics: what is logged, what is written, that nothing scales it."""
 
 import os
-import subprocess
 import sys
 
 import numpy as np
@@ -20,6 +19,7 @@ from sb3_cchain.envs import RewardScale
 from sb3_cchain.methods import Oracle
 from tests.envs import CountEnv
 from tests.method_models import make_model
+from tests.resume_cases import in_new_process
 
 SETTINGS = dict(n_steps=16, batch_size=8, device="cpu", seed=0)
 
@@ -136,21 +136,32 @@ def test_a_fresh_run_does_not_touch_a_foreign_file(tmp_path):
     assert path.read_text() == "name,price\nscrews,3\n"
 
 
+def write_returns(path):
+    """For another process, which ends while the file is open."""
+    try:
+        OPEN.append(ReturnsFile(path, [], keep_old=True))
+        return "open"
+    except ValueError as error:
+        return str(error)
+
+
+OPEN = []
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
 def test_two_processes_cannot_write_one_file(tmp_path):
-    path = tmp_path / "returns.csv"
-    code = (
-        "import sys, pathlib; from sb3_cchain.callbacks.returns_file import ReturnsFile;"
-        "file = ReturnsFile(pathlib.Path(sys.argv[1]), [], keep_old=True); print('open', flush=True); sys.stdin.read()"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout.readline() == "open\n"
+    path, heard = tmp_path / "returns.csv", []
+
+    class Meanwhile(Spy):
+        def _on_step(self):
+            if self.n_calls == 1:
+                heard.append(in_new_process(write_returns, path))
+            return True
+
     model = CChainPPO("MlpPolicy", make_env(), **SETTINGS)
-    with pytest.raises(ValueError, match=r"Another process is writing .*returns\.csv"):
-        model.learn(16, callback=ContinualMetrics(path))
-    process.communicate()
+    model.learn(16, callback=[ContinualMetrics(path), Meanwhile()])
+    assert heard[0].startswith(f"Another process is writing {path}") and len(read_returns(path)) == 1
+    assert in_new_process(write_returns, path) == "open"
     model.learn(16, callback=ContinualMetrics(path))  # it has ended
     assert len(read_returns(path)) == 1
 
