@@ -129,6 +129,8 @@ def test_trains_and_logs(member, target):
     extra = {"PPO": {"churn/value_churn"}, "DQN": {"churn/greedy_action_changes"}}.get(member.name, set())
     assert expected <= logged(model).keys() <= expected | extra
     assert all(np.isfinite(value) for value in logged(model).values())
+    # Of the absolute value of the loss, which some have below 0
+    assert all(value > 0 for key, value in logged(model).items() if key.endswith("/relative_loss"))
     assert list(model.churn_reducers) == list(targets)
     assert model.policy.state_dict().keys() == member.make(member.stock).policy.state_dict().keys()
     # Nothing of it stays on SB3's objects
