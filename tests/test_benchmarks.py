@@ -1,5 +1,6 @@
 """The commands ``demo``, ``compare`` and ``references``, with a training command that starts at once."""
 
+import subprocess
 import sys
 from functools import partial
 
@@ -8,11 +9,10 @@ import pytest
 from benchmarks import compare, demo, references
 from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.results import read_results
-from benchmarks.grid.run import make_run
+from benchmarks.grid.run import ROOT, make_run
 from benchmarks.report.random_policy import look_at_task
 from tests.extras import needs_dm_control
 from tests.fake_training import fake_program
-from tests.resume_cases import in_new_process
 
 LENGTH = ["--n-tasks", "2", "--steps-per-task", "800"]
 
@@ -120,7 +120,8 @@ def test_what_the_commands_do_not_need():
         "for name in ('ray', 'rliable', 'seaborn', 'markdown_it', 'optuna', 'rl_zoo3'): sys.modules[name] = None\n"
         "import benchmarks.demo, benchmarks.compare, benchmarks.plasticity.__main__, benchmarks.run"
     )
-    in_new_process(exec, code)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_task_without_an_agent():

@@ -276,6 +276,15 @@ def test_no_warning_where_there_was_no_update():
     assert not optimizer._optimizer_step_post_hooks
 
 
+def test_an_optimiser_without_hooks():
+    optimizer = th.optim.Adam(make_network().parameters())
+    del optimizer._optimizer_step_post_hooks  # as of a class that does not call PyTorch's constructor
+    calls = []
+    with extra_gradient(optimizer, lambda: calls.append("backward")):
+        optimizer.zero_grad()
+    assert calls == ["backward"]
+
+
 def test_reducer_standalone_against_written_out_loss():
     """The loop of the class's docstring, against one that keeps a copy of the network."""
     import copy

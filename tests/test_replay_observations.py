@@ -152,14 +152,21 @@ def test_the_buffer_of_training_is_left_as_it_is(draw_beside_training):
 
 
 @pytest.mark.parametrize("callback", [CChainCallback(), ChurnMonitor(interval=1, batch_size=8)])
-def test_training_alone_draws_from_its_buffer(callback):
-    drawn_from = []
+def test_at_each_update_the_buffer_remembers_the_minibatch(callback):
+    drawn, remembers_minibatch = [], []
 
     class Buffer(RememberingBuffer):
         def sample(self, batch_size, env=None):
-            drawn_from.append(self)
-            return super().sample(batch_size, env)
+            samples = super().sample(batch_size, env)
+            drawn.append(self.last_drawn)
+            return samples
+
+    def after_update(*_):
+        minibatch = next(each for each in drawn if len(each) == model.batch_size)
+        remembers_minibatch.append(model.replay_buffer.last_drawn is minibatch)
+        drawn.clear()
 
     model = DQN("MlpPolicy", "CartPole-v1", replay_buffer_class=Buffer, learning_starts=8, device="cpu", seed=0)
+    model.policy.optimizer.register_step_post_hook(after_update)
     model.learn(40, callback)
-    assert sum(buffer is model.replay_buffer for buffer in drawn_from) == model._n_updates < len(drawn_from)
+    assert len(remembers_minibatch) == model._n_updates > 0 and all(remembers_minibatch)

@@ -1,7 +1,8 @@
 """Draws observations from a replay buffer, and actions, for a batch that needs no rewards or next observations."""
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -10,22 +11,25 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.replaced import replaced
 
-BufferT = TypeVar("BufferT", bound=ReplayBuffer)
-
 # How SB3's replay buffers draw transitions, and how they gather those that were drawn. HerReplayBuffer does otherwise
 _DRAWS = (ReplayBuffer.sample, DictReplayBuffer.sample)
 _GATHERS = (ReplayBuffer._get_samples, DictReplayBuffer._get_samples, NStepReplayBuffer._get_samples)
 
 
-def beside_training(buffer: BufferT) -> BufferT:
+@contextmanager
+def unchanged(buffer: ReplayBuffer) -> Iterator[None]:
     """
-    :param buffer: The replay buffer of a model that is being trained
-    :return: Another buffer with the same data, to draw from for other ends than training. What a buffer sets in itself when it
-        is drawn from, such as the indices whose priorities follow the losses, stays as the training left it.
+    Draw from the replay buffer of a model that is being trained, for other ends than training. What a buffer sets in itself
+    when it is drawn from, such as the indices whose priorities follow the losses, is put back afterwards.
+
+    :param buffer: The replay buffer
     """
-    other = object.__new__(type(buffer))
-    vars(other).update(vars(buffer))
-    return other
+    before = dict(vars(buffer))
+    try:
+        yield
+    finally:
+        vars(buffer).clear()
+        vars(buffer).update(before)
 
 
 def sample_observations(
@@ -41,9 +45,9 @@ def sample_observations(
     :param with_actions: Whether the actions are drawn, too
     :return: The observations; with actions ``observations`` and ``actions``
     """
-    buffer = beside_training(buffer)
     if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS):
-        samples: Any = buffer.sample(batch_size, env=env)
+        with unchanged(buffer):
+            samples: Any = buffer.sample(batch_size, env=env)
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         indices: Any = buffer.sample(batch_size)

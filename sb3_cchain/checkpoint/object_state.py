@@ -7,8 +7,7 @@ an open file, is that of the new process. All contents are pickled at once, so t
 object afterwards.
 
 An object that knows better what its state is has the methods ``state_dict()`` and ``load_state_dict(state)``, as PyTorch's
-modules and optimisers have. Its attributes are not looked at then, but for those of modules and optimisers that training made
-and that are not there in the new process.
+modules and optimisers have. Its attributes are not looked at then.
 """
 
 import importlib
@@ -37,9 +36,6 @@ KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, propert
 # They are copied as a whole
 DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
 
-# Whose attributes are saved beside their `state_dict()`, because training may make them, such as copies of a network
-MADE_ANEW = (th.nn.Module, th.optim.Optimizer)
-
 # Packages of windows and pictures, which belong to the process, too
 DISPLAYS = frozenset({"pygame", "glfw", "OpenGL", "matplotlib"})
 
@@ -58,13 +54,13 @@ class Entry(NamedTuple):
     :param owner: Number of the entry whose attribute refers to it; None for a holder
     :param name: Name of the attribute, or of the holder
     :param kind: Name of its class, by which it is made where it is not there; None where it cannot be made
-    :param has_state_dict: Whether its content is what ``state_dict()`` returned
+    :param is_needed: Whether it has to be there to take its state
     """
 
     owner: int | None
     name: str
     kind: str | None
-    has_state_dict: bool = False
+    is_needed: bool = False
 
 
 class ObjectStates(NamedTuple):
@@ -72,8 +68,8 @@ class ObjectStates(NamedTuple):
     States of objects. It can be pickled, and does not change any more.
 
     :param entries: The objects
-    :param content: Pickled: for each of them its attributes, or what ``state_dict()`` returned; and for modules and optimisers
-        their attributes, too. It refers to the entries by their numbers, and to known objects by their names
+    :param content: Pickled: for each of them its attributes, or what ``state_dict()`` returned. It refers to the entries by
+        their numbers, and to known objects by their names
     """
 
     entries: list[Entry]
@@ -159,28 +155,22 @@ def restore_objects(holders: Mapping[str, object], states: ObjectStates, known: 
     """
     found: list[Any] = []
     taken: set[int] = set()
-    made: set[int] = set()
-    for number, entry in enumerate(states.entries):
+    for entry in states.entries:
         there = holders[entry.name] if entry.owner is None else vars(found[entry.owner]).get(entry.name)
         # Two objects may have been one in this process until now
-        if entry.kind is not None and (
-            there is None if entry.has_state_dict else _kind_name(there) != entry.kind or id(there) in taken
-        ):
+        if entry.kind is not None and (_kind_name(there) != entry.kind or id(there) in taken):
             there = _make(find_named(entry.kind))
-            made.add(number)
+        if there is None and entry.is_needed:
+            raise ValueError(
+                f"{entry.name}: training made this object, and there is none here that could take its state. Make it in the "
+                "constructor or in _on_training_start()"
+            )
         found.append(there)
         taken.add(id(there))
-    contents, attributes = StateUnpickler(io.BytesIO(states.content), {**(known or {}), **dict(enumerate(found))}).load()
+    contents = StateUnpickler(io.BytesIO(states.content), {**(known or {}), **dict(enumerate(found))}).load()
     for number, content in contents.items():
         entry, value, own = states.entries[number], found[number], _own_state(found[number])
-        if entry.has_state_dict and (value is None or number in made):
-            if number not in attributes:
-                raise ValueError(
-                    f"{entry.name}: training made this object, and there is none here that could take its state. Make it in "
-                    "the constructor or in _on_training_start()"
-                )
-            value.__setstate__(attributes[number])
-        elif own is not None:
+        if own is not None:
             try:
                 own.restore(value, content)
             except ValueError as error:
@@ -221,8 +211,6 @@ class _Reader:
         self.entries = [Entry(None, name, None) for name in holders]
         # Of each entry: its attributes or own state, the way to it, and whether all of it has to be saved
         self._contents: dict[int, Any] = {}
-        # Of modules and optimisers
-        self._attributes: dict[int, Any] = {}
         self._paths = list(holders)
         self._strict = [name in strict for name in holders]
         self._with_attributes: list[int] = []
@@ -238,8 +226,6 @@ class _Reader:
         own = _own_state(value)
         if own is not None:
             self._contents[number] = own.read(value)
-            if isinstance(value, MADE_ANEW) and self.entries[number].kind is not None:
-                self._attributes[number] = value.__reduce_ex__(2)[2]
             return
         self._with_attributes.append(number)
         attributes = self._contents[number] = {}
@@ -257,8 +243,7 @@ class _Reader:
             return True
         own = _own_state(value)
         if own is not None:
-            can_be_made = own in (*_GENERATORS, *_CONTAINERS) or (isinstance(value, MADE_ANEW) and _can_be_found(type(value)))
-            self._enter(owner, name, value, _kind_name(value) if can_be_made else None)
+            self._enter(owner, name, value, _kind_name(value) if own in (*_GENERATORS, *_CONTAINERS) else None)
         elif isinstance(value, spaces.Space) or (not _is_data(value) and self._is_of_state(owner, value)):
             self._enter(owner, name, value, _kind_name(value))
         elif isinstance(value, np.ndarray):
@@ -273,7 +258,9 @@ class _Reader:
 
     def _enter(self, owner: int, name: str, value: object, kind: str | None) -> None:
         number = self._references[id(value)] = len(self.entries)
-        self.entries.append(Entry(owner, name, kind, _has_state_dict(type(value))))
+        # This package's own, such as an open file of returns, are there where they are needed
+        is_needed = _has_state_dict(type(value)) and _package(type(value)) != "sb3_cchain"
+        self.entries.append(Entry(owner, name, kind, is_needed))
         self._paths.append(self._path(owner, name))
         self._strict.append(self._strict[owner])
         self._read(number, value)
@@ -285,14 +272,13 @@ class _Reader:
         """All contents. What they refer to has to be there until then."""
         self._filter(lambda number, name, value: not _is_code(value) or self._can_refer_to(value))
         try:
-            return self._pickle((self._contents, self._attributes))
+            return self._pickle(self._contents)
         except Exception:  # whatever the code of an object raises
             self._filter(lambda number, name, value: self._can_pickle(number, value, self._path(number, name)))
             for number in self._contents.keys() - self._with_attributes:
                 if not self._can_pickle(number, self._contents[number], self._paths[number]):
                     del self._contents[number]
-            self._attributes = {number: each for number, each in self._attributes.items() if self._is_picklable(each)}
-            return self._pickle((self._contents, self._attributes))
+            return self._pickle(self._contents)
 
     def _filter(self, is_kept: Callable[[int, str, Any], bool]) -> None:
         """Keep some of the attributes."""
@@ -303,7 +289,10 @@ class _Reader:
     def _can_refer_to(self, code: Any) -> bool:
         if isinstance(code, MethodType):
             return id(code.__self__) in self._references and getattr(code.__self__, code.__name__, None) == code
-        return _can_be_found(code)
+        try:
+            return find_named(name_in_module(code)) is code
+        except (AttributeError, ImportError):  # made by other code
+            return False
 
     def _can_pickle(self, number: int, value: Any, path: str) -> bool:
         try:
@@ -313,13 +302,6 @@ class _Reader:
             if self._strict[number]:
                 raise NotSaved(f"{path}: {error}") from error
             self._left_out.append(path)
-            return False
-
-    def _is_picklable(self, value: Any) -> bool:
-        try:
-            self._pickle(value)
-            return True
-        except Exception:  # whatever the code of an object raises
             return False
 
     def _pickle(self, value: Any) -> bytes:
@@ -478,10 +460,3 @@ def find_named(name: str) -> Any:
     for part in qualified.split("."):
         found = getattr(found, part)
     return found
-
-
-def _can_be_found(named: Any) -> bool:
-    try:
-        return find_named(name_in_module(named)) is named
-    except (AttributeError, ImportError):  # made by other code
-        return False

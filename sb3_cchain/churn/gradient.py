@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch as th
@@ -38,12 +38,11 @@ def extra_gradient(optimizer: th.optim.Optimizer, backward: Callable[[], object]
         nonlocal n_updates
         n_updates += 1
 
-    counting = optimizer.register_step_post_hook(count_update)
-    try:
+    with ExitStack() as stack:
+        if hasattr(optimizer, "_optimizer_step_post_hooks"):  # not where a class does without PyTorch's constructor
+            stack.callback(optimizer.register_step_post_hook(count_update).remove)
         with replaced(optimizer, "zero_grad", zero_grad_and_backward):
             yield
-    finally:
-        counting.remove()
     if n_updates > 0 and n_calls == 0:
         warnings.warn(
             "Updates were made without a call of the optimiser's `zero_grad()`, so churn was not reduced. Call it before each "
