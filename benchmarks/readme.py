@@ -11,10 +11,11 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.grid.results import Result, read_results
+from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, short_name, suite_lines
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.cells import Cell, Cells, make_cells
+from benchmarks.report.collapses import COLLAPSED, collapses, collapses_table
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
 from benchmarks.report.places import write_tables
@@ -25,11 +26,6 @@ from sb3_cchain.analysis.plots import import_matplotlib
 
 SUITE, BUDGET = "gym_control", "paper"
 METHODS = ("oracle", "vanilla", "cchain")
-
-# A policy has collapsed where the mean return of the last ten rollouts of a task is below this. The best policy that repeats
-# one action has -400 in Acrobot, 9.5 in CartPole and -139 in LunarLander, where it leaves the engines off. Not in MountainCar,
-# where a policy that has not found the goal yet looks the same. Other runs may learn something and still end below this
-COLLAPSED = {"Continual/Acrobot-v1": -250, "Continual/CartPole-v1": 100, "Continual/LunarLander-v3": -100}
 
 # The picture
 PICTURED = "Continual/LunarLander-v3"
@@ -45,19 +41,6 @@ def read_cells(results: Path) -> Cells:
     found, _ = read_results(results / BUDGET / SUITE)
     cells, _ = make_cells([result for result in found if result.line in METHODS])
     return cells
-
-
-def collapses(results: Sequence[Result]) -> tuple[int, int]:
-    """
-    :param results: Runs in environments of ``COLLAPSED``
-    :return: Tasks after a switch at whose end the policy has collapsed, and tasks after a switch
-    """
-    ends = [
-        bool(result.returns_in_task(task)[1][-10:].mean() < COLLAPSED[result.env_id])
-        for result in results
-        for task in range(1, result.n_tasks)
-    ]
-    return sum(ends), len(ends)
 
 
 def readme_table(cells: Cells) -> str:
@@ -90,19 +73,22 @@ def readme_table(cells: Cells) -> str:
     return f"{markdown_table(header, rows)}\n\n{sentence}"
 
 
-def task_tables(results: Path) -> str:
+def documentation_tables(results: Path) -> dict[str, str]:
     """
     :param results: Folder of all results
-    :return: The mean return of each run on each task, a table for each environment
+    :return: The tables of the documentation, by their names: a table for each environment of the mean return of each run on
+        each task, and of the policy churn in its first iteration
     """
     runs, _ = read_results(results / BUDGET / SUITE)
     lines = suite_lines(SUITE, {run.line for run in runs})
-    parts = []
+    returns, churn = [], []
     for env_id in SUITES[SUITE].env_ids:
-        here = [run for run in runs if run.env_id == env_id]
+        here, name = [run for run in runs if run.env_id == env_id], short_name(env_id)
         header = returns_header([str(task) for task in range(here[0].n_tasks)])
-        parts.append(f"{short_name(env_id)}:\n\n{markdown_table(header, returns_rows(here, lines, digits=0))}")
-    return "\n\n".join(parts)
+        returns.append(f"{name}:\n\n{markdown_table(header, returns_rows(here, lines, digits=0))}")
+        if env_id in COLLAPSED:
+            churn.append(f"{name}:\n\n{collapses_table(here, lines)}")
+    return {"gym_control_tasks": "\n\n".join(returns), "gym_control_collapses": "\n\n".join(churn)}
 
 
 def _score(cell: Cell | None) -> str:
@@ -153,11 +139,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in TITLES if (env_id, method) not in cells]
     if missing:
         parser.error(f"--results must have runs of {', '.join(missing)}; there are none in {args.results}")
-    table, tables_of_tasks = readme_table(cells), task_tables(args.results)
-    print(table, tables_of_tasks, sep="\n\n")
+    table, others = readme_table(cells), documentation_tables(args.results)
+    print(table, *others.values(), sep="\n\n")
     if args.write:
         write_tables({"readme": table}, ROOT / "README.md")
-        write_tables({"gym_control_tasks": tables_of_tasks}, ROOT / "docs")
+        write_tables(others, ROOT / "docs")
         plot(cells, PICTURE)
 
 

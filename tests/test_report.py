@@ -15,6 +15,7 @@ from benchmarks.grid.suites import SUITES, paper_length
 from benchmarks.report.__main__ import main
 from benchmarks.report.best_of import COLUMNS, best_strengths, best_table, paper_strengths, write_best
 from benchmarks.report.cells import make_cells
+from benchmarks.report.collapses import collapses, collapses_table
 from benchmarks.report.continual_table import continual_table
 from benchmarks.report.document import write_report
 from benchmarks.report.estimates import (
@@ -31,7 +32,7 @@ from benchmarks.report.estimates import (
 )
 from benchmarks.report.figures import plot_learning_curves, plot_quantities
 from benchmarks.report.first_sight import missing_runs, missing_section
-from benchmarks.report.markdown import code, escaped
+from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.page import html_page
 from benchmarks.report.paper import read_tables
 from benchmarks.report.quantities import NTK, PLASTICITY, RETURNS, Quantity
@@ -497,6 +498,19 @@ def test_no_text_of_a_run_acts_as_markup(tmp_path, text, no_drawing):
     assert "c2VjcmV0" not in page and page.count("<h1") == 1 and "\n# b" not in text_lines
     # Two tables have a column for each task, and no further one
     assert page.count("<th>J(T)</th>") == 2 and page.count("<th>task 1</th>") == 1
+
+
+def test_where_a_policy_has_collapsed_and_with_which_churn_it_began(tmp_path):
+    # The mean of the last ten rollouts counts: a single return of -400 is no collapse. Each value is logged a rollout late
+    churn = [(120, "churn/policy_churn", 0.25), (130, "churn/policy_churn", 1.0)]
+    write(tmp_path, "cchain", [[-400] * 12, [-100] * 9 + [-400]], metrics=churn)
+    write(tmp_path, "cchain", [[-90] * 12, [-90, -90] + [-400] * 10], seed=1, metrics=[(120, "churn/policy_churn", 2e-9)])
+    write(tmp_path, "vanilla", [[-90] * 12, [-400] * 12])
+    results = whole_results(tmp_path)
+    assert collapses(results) == (2, 3)
+    assert collapses_table(results, GYM_LINES) == markdown_table(
+        ["method", "seed", "1"], [["C-CHAIN PPO", "0", "0.2"], ["C-CHAIN PPO", "1", "**2e-09**"]]
+    )
 
 
 def make_results(folder):

@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from benchmarks.readme import read_cells, readme_table, task_tables
+from benchmarks.readme import documentation_tables, read_cells, readme_table
 from benchmarks.report.places import PLACE
 from tests.test_docs import ALL_PAGES, ROOT, name_of, without_code
 
@@ -97,7 +97,8 @@ def tables(page: Path) -> dict[str, str]:
 def test_the_readme_shows_the_committed_results():
     results, write = ROOT / "benchmarks/results", "run python -m benchmarks.readme --write"
     assert readme_table(read_cells(results)) in tables(ROOT / "README.md")["readme"], write
-    assert task_tables(results) in tables(DOCS / "results/gym_control.md")["gym_control_tasks"], write
+    for name, table in documentation_tables(results).items():
+        assert table in tables(DOCS / "results/gym_control.md")[name], write
 
 
 # Rows of the tables of the speed page, and the ratio to PPO that is stated elsewhere and in the page's first lines

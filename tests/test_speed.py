@@ -214,7 +214,14 @@ def test_each_table_has_one_place_in_the_documentation():
     places = [name for page in (ROOT / "docs").rglob("*.md") for name in PLACE.findall(page.read_text())]
     of_family = [f"family_{name}" for name in family.CASES]
     of_family += ["family_evidence", *(f"falls_{name}" for name, case in family.CASES.items() if case.solved is not None)]
-    others = ["made_with", "gpu", "shelf", "gym_control_tasks", *(f"supervised_{name}" for name in PROBLEMS)]
+    others = [
+        "made_with",
+        "gpu",
+        "shelf",
+        "gym_control_tasks",
+        "gym_control_collapses",
+        *(f"supervised_{name}" for name in PROBLEMS),
+    ]
     others += ["plasticity", "sensitivity_cost", *(f"sensitivity_{name}" for name in PARAMETERS)]
     others += ["doctor_findings", "doctor_confusion", "doctor_wrong", "doctor_sick"]
     assert sorted(places) == sorted([*others, *speed.CASES, *speed.OTHERS, *of_family])
