@@ -146,151 +146,146 @@ def _family() -> Iterator[Method]:
         yield Method("cchain", f"{name}_cchain", algorithm, label, "tab:blue", FAMILY_PAGE, strength=BETA)
 
 
+def _optimizer(name: str, label: str, color: str, optimizer_class: type[OptimizerWrapper], **fields: Any) -> Method:
+    """PPO with a wrapper around its optimiser."""
+    fields = {"page": OPTIMIZER_PAGE, "callbacks": (OptimizerMetrics,), **fields}
+    return Method(name, f"ppo_{name}", PPO, label, color, optimizer_class=optimizer_class, **fields)
+
+
+def _callback(name: str, label: str, color: str, callback: type[BaseCallback], **fields: Any) -> Method:
+    """PPO with a callback."""
+    return Method(name, f"ppo_{name}", PPO, label, color, callbacks=(callback,), **{"page": PLASTICITY_PAGE, **fields})
+
+
+def _network(name: str, label: str, color: str, policy: type[BasePolicy], **fields: Any) -> Method:
+    """PPO with a network of another kind."""
+    return Method(name, f"ppo_{name}", PPO, label, color, PLASTICITY_PAGE, policy=policy, **fields)
+
+
 # In the order of the report's tables
 REGISTRY = (
-    Method("oracle", "ppo_oracle", PPO, "Oracle", "tab:brown", PLASTICITY_PAGE, PPO_SUITES, callbacks=(Oracle,)),
+    _callback("oracle", "Oracle", "tab:brown", Oracle, suites=PPO_SUITES),
     Method(
         "oracle", "double_dqn_oracle", DoubleDQN, "Oracle", "tab:brown", PLASTICITY_PAGE, ("minatar",), callbacks=(Oracle,)
     ),
     Method("vanilla", "ppo", PPO, "PPO", "tab:gray", "modules/ppo_cchain", PPO_SUITES),
     Method("vanilla", "double_dqn", DoubleDQN, "Double DQN", "tab:gray", "modules/dqn_cchain", ("minatar",)),
-    Method(
-        *("trac", "ppo_trac", PPO, "TRAC", "tab:orange", OPTIMIZER_PAGE, ("gym_control", "procgen")),
-        optimizer_class=TRAC,
-        callbacks=(OptimizerMetrics,),
-    ),
-    Method(
-        *("weight_clipping", "ppo_weight_clipping", PPO, "Weight clipping", "tab:green", OPTIMIZER_PAGE),
+    _optimizer("trac", "TRAC", "tab:orange", TRAC, suites=("gym_control", "procgen")),
+    _optimizer(
+        "weight_clipping",
+        "Weight clipping",
+        "tab:green",
+        WeightClipping,
         suites=("gym_control", "procgen"),
-        optimizer_class=WeightClipping,
-        callbacks=(OptimizerMetrics,),
         grid={KAPPA.argument: KAPPA.paper_values},
         strength=KAPPA,
     ),
-    Method(
-        *("l2_init", "ppo_l2_init", PPO, "L2 Init", "tab:red", OPTIMIZER_PAGE, ("gym_control", "procgen")),
-        optimizer_class=L2Init,
-        callbacks=(OptimizerMetrics,),
+    _optimizer(
+        "l2_init",
+        "L2 Init",
+        "tab:red",
+        L2Init,
+        suites=("gym_control", "procgen"),
         grid={C.argument: C.paper_values},
         strength=C,
     ),
-    Method(
-        *("layer_norm", "ppo_layer_norm", PPO, "LayerNorm", "tab:purple", PLASTICITY_PAGE, ("procgen",)),
-        policy=LayerNormPolicy,
-    ),
-    Method(
-        *("redo", "ppo_redo", PPO, "ReDo", "tab:pink", PLASTICITY_PAGE, ("procgen",)),
-        callbacks=(ReDo,),
+    _network("layer_norm", "LayerNorm", "tab:purple", LayerNormPolicy, suites=("procgen",)),
+    _callback(
+        "redo",
+        "ReDo",
+        "tab:pink",
+        ReDo,
+        suites=("procgen",),
         # The paper has no grid. τ: dead units alone, the value of ReDo's DQN, and four times that. Interval in iterations:
         # Plasticine's, a tenth and ten times that
         grid={"tau": [0.0, 0.025, 0.1], "interval": [1, 10, 100]},
     ),
-    Method(
-        *("adam_rel", "ppo_adam_rel", PPO, "AdamRel", "tab:olive", OPTIMIZER_PAGE, ("procgen",)),
-        callbacks=(AdamRel,),
-    ),
-    Method(
-        *("parseval", "ppo_parseval", PPO, "Parseval", "tab:cyan", OPTIMIZER_PAGE),
-        optimizer_class=Parseval,
+    _callback("adam_rel", "AdamRel", "tab:olive", AdamRel, page=OPTIMIZER_PAGE, suites=("procgen",)),
+    _optimizer(
+        "parseval",
+        "Parseval",
+        "tab:cyan",
+        Parseval,
         optimizer_kwargs={"n_output_layers": 2},
-        callbacks=(OptimizerMetrics,),
         grid={"coef": [1e-5, 1e-4, 1e-3, 1e-2]},  # a decade around those of its code
     ),
-    Method(
-        *("shrink_and_perturb", "ppo_shrink_and_perturb", PPO, "Shrink and perturb", "darkkhaki", PLASTICITY_PAGE),
-        callbacks=(ShrinkAndPerturb,),
+    _callback(
+        "shrink_and_perturb",
+        "Shrink and perturb",
+        "darkkhaki",
+        ShrinkAndPerturb,
         # After every update (Plasticine's), and the same shrinkage at once after a hundred
         grid={"shrink": [0.9999, 0.99999, 0.999999], "interval": [1, 100]},
     ),
-    Method(
-        *("crelu", "ppo_crelu", PPO, "CReLU", "teal", PLASTICITY_PAGE),
-        policy=CReLUPolicy,
-        policy_kwargs={"activation_fn": CReLU},
-    ),
-    Method(
-        *("layer_reset", "ppo_layer_reset", PPO, "Layer reset", "indigo", PLASTICITY_PAGE),
-        callbacks=(LayerReset,),
+    _network("crelu", "CReLU", "teal", CReLUPolicy, policy_kwargs={"activation_fn": CReLU}),
+    _callback(
+        "layer_reset",
+        "Layer reset",
+        "indigo",
+        LayerReset,
         # Of the four layers of the Gym Control networks. 20, 4 and 2 resets in a task
         grid={"n_layers": [1, 2, 4], "interval": [8_000, 40_000, 80_000]},
     ),
-    Method(
-        *("plasticity_injection", "ppo_plasticity_injection", PPO, "Plasticity injection", "gold", PLASTICITY_PAGE),
-        callbacks=(PlasticityInjection,),
+    _callback(
+        "plasticity_injection",
+        "Plasticity injection",
+        "gold",
+        PlasticityInjection,
         policy=InjectionPolicy,
         grid={"timestep": [160_000, 320_000, 640_000]},  # the first switch of Gym Control's tasks, and later ones
     ),
-    Method(
-        *("normalize_and_project", "ppo_normalize_and_project", PPO, "Normalize and project", "yellowgreen", OPTIMIZER_PAGE),
-        optimizer_class=NormalizeAndProject,
+    _optimizer(
+        "normalize_and_project",
+        "Normalize and project",
+        "yellowgreen",
+        NormalizeAndProject,
         optimizer_kwargs={"n_output_layers": 2},
-        callbacks=(OptimizerMetrics,),
         policy=LayerNormPolicy,
     ),
-    Method(
-        *("fourier", "ppo_fourier", PPO, "Deep Fourier features", "crimson", PLASTICITY_PAGE),
-        policy=FourierPolicy,
-        policy_kwargs={"activation_fn": FourierFeatures},
-    ),
-    Method(
-        *("continual_backprop", "ppo_continual_backprop", PPO, "Continual backprop", "olivedrab", PLASTICITY_PAGE),
-        callbacks=(ContinualBackprop,),
+    _network("fourier", "Deep Fourier features", "crimson", FourierPolicy, policy_kwargs={"activation_fn": FourierFeatures}),
+    _callback(
+        "continual_backprop",
+        "Continual backprop",
+        "olivedrab",
+        ContinualBackprop,
         grid={"replacement_rate": [1e-5, 1e-4, 1e-3], "maturity_threshold": [1000, 10_000]},  # a decade around the paper's
     ),
-    Method(
-        *("regrama", "ppo_regrama", PPO, "ReGraMa", "darkorchid", PLASTICITY_PAGE),
-        callbacks=(ReGraMa,),
+    _callback(
+        "regrama",
+        "ReGraMa",
+        "darkorchid",
+        ReGraMa,
         # τ: the paper's, units without any gradient, and ten times the paper's. Interval in iterations, as of ReDo
         grid={"tau": [0.0, 0.01, 0.1], "interval": [1, 10, 100]},
     ),
-    Method(
-        *("self_normalized_resets", "ppo_self_normalized_resets", PPO, "Self-normalized resets", "peru", PLASTICITY_PAGE),
-        callbacks=(SelfNormalizedResets,),
+    _callback(
+        "self_normalized_resets",
+        "Self-normalized resets",
+        "peru",
+        SelfNormalizedResets,
         grid={"eta": [0.01, 0.02, 0.04, 0.08]},
     ),
-    Method(
-        *("fire", "ppo_fire", PPO, "FIRE", "orangered", PLASTICITY_PAGE),
-        callbacks=(FIRE,),
-        grid={"n_iterations": [5, 10]},
-    ),
-    Method(
-        *("spectral_regularization", "ppo_spectral_regularization", PPO, "Spectral regularisation", "tomato", OPTIMIZER_PAGE),
-        optimizer_class=SpectralRegularization,
-        callbacks=(OptimizerMetrics,),
+    _callback("fire", "FIRE", "orangered", FIRE, grid={"n_iterations": [5, 10]}),
+    _optimizer(
+        "spectral_regularization",
+        "Spectral regularisation",
+        "tomato",
+        SpectralRegularization,
         grid={"coef": [1e-5, 1e-4, 1e-3, 1e-2], "power": [1, 2]},
     ),
-    Method(
-        *("ewc", "ppo_ewc", PPO, "EWC", "mediumseagreen", OPTIMIZER_PAGE),
-        optimizer_class=EWC,
+    _optimizer(
+        "ewc",
+        "EWC",
+        "mediumseagreen",
+        EWC,
         callbacks=(EWCConsolidation, OptimizerMetrics),
         grid={"coef": [1.0, 100.0, 10_000.0], "decay": [0.5, 1.0]},
     ),
-    Method(
-        *("upgd", "ppo_upgd", PPO, "UPGD", "rebeccapurple", OPTIMIZER_PAGE),
-        optimizer_class=UPGD,
-        callbacks=(OptimizerMetrics,),
-        grid={"sigma": [0.0, 0.001, 0.01], "beta": [0.99, 0.999]},
-    ),
-    Method(
-        *("muon", "ppo_muon", PPO, "Muon", "deeppink", OPTIMIZER_PAGE),
-        optimizer_class=Muon,
-        optimizer_kwargs={"n_output_layers": 2},
-        callbacks=(OptimizerMetrics,),
-        grid={"lr_factor": [0.3, 1.0, 3.0]},
-    ),
-    Method(
-        *("kron", "ppo_kron", PPO, "Kron", "steelblue", OPTIMIZER_PAGE),
-        optimizer_class=Kron,
-        grid={"update_probability": [0.03, 0.1, 1.0]},
-    ),
-    Method(
-        *("spectral_norm", "ppo_spectral_norm", PPO, "Spectral normalisation", "slategray", PLASTICITY_PAGE),
-        policy=SpectralNormPolicy,
-    ),
-    Method(
-        *("simba", "ppo_simba", PPO, "SimBa", "chocolate", PLASTICITY_PAGE),
-        policy=SimBaPolicy,
-        policy_kwargs={"net_arch": {"pi": [128], "vf": [512, 512]}},
-    ),
+    _optimizer("upgd", "UPGD", "rebeccapurple", UPGD, grid={"sigma": [0.0, 0.001, 0.01], "beta": [0.99, 0.999]}),
+    _optimizer("muon", "Muon", "deeppink", Muon, optimizer_kwargs={"n_output_layers": 2}, grid={"lr_factor": [0.3, 1.0, 3.0]}),
+    _optimizer("kron", "Kron", "steelblue", Kron, callbacks=(), grid={"update_probability": [0.03, 0.1, 1.0]}),
+    _network("spectral_norm", "Spectral normalisation", "slategray", SpectralNormPolicy),
+    _network("simba", "SimBa", "chocolate", SimBaPolicy, policy_kwargs={"net_arch": {"pi": [128], "vf": [512, 512]}}),
     Method("cchain", "ppo_cchain", CChainPPO, "C-CHAIN PPO", "tab:blue", "modules/ppo_cchain", PPO_SUITES, strength=BETA),
     Method("cchain", "dqn_cchain", CChainDQN, "C-CHAIN DQN", "tab:blue", "modules/dqn_cchain", ("minatar",), strength=BETA),
     *_family(),
