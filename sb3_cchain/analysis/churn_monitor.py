@@ -12,9 +12,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, known_kind, model_outputs
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.networks.batch_outputs import Batch
 from sb3_cchain.networks.model_optimizers import is_trpo, model_optimizers
 from sb3_cchain.tensorboard.overview import add_overview

@@ -8,7 +8,6 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.analysis.findings import CHECKS, Finding, diagnose
 from sb3_cchain.analysis.model_outputs import ModelOutputs, model_outputs
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import sample_batch
 from sb3_cchain.analysis.symptoms import (
     Symptoms,
@@ -23,6 +22,7 @@ from sb3_cchain.analysis.symptoms import (
 )
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.networks.batch_outputs import Batch
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tensorboard.layout import add_charts

@@ -19,10 +19,10 @@ from sb3_cchain.analysis import ChurnMonitor, Doctor, NetworkHealth, NTKCallback
 from sb3_cchain.analysis.findings import CHECKS, Finding, as_json, diagnose
 from sb3_cchain.analysis.health_figures import trained_groups
 from sb3_cchain.analysis.ntk import has_ntk
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.symptoms import Symptoms, is_finite, symptoms_of, weight_symptoms
 from sb3_cchain.analysis.task_evaluation import TaskEvaluation
 from sb3_cchain.callbacks import ContinualMetrics, TaskLearningStarts
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks import TaskSync

@@ -4,10 +4,10 @@ import torch as th
 
 from sb3_cchain.analysis.health_figures import network_health, remember_initial_parameters, trained_groups
 from sb3_cchain.analysis.metrics.norms import group_norms
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.reference_batch import sample_batch
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.validation import check_number
 

@@ -11,9 +11,9 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.analysis.metrics.ntk import ntk_statistics
 from sb3_cchain.analysis.ntk import has_ntk, policy_ntk, q_ntk
 from sb3_cchain.analysis.plots import import_matplotlib, plot_ntk
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.analysis.training_interval import TrainingInterval
 from sb3_cchain.callbacks.log_folder import log_path
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.validation import check_number
 
 # When `picture_interval` is not given

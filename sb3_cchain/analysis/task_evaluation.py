@@ -16,9 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_cchain.analysis.random_state import unchanged_random_state
 from sb3_cchain.callbacks.log_folder import log_path
 from sb3_cchain.callbacks.returns_file import ReturnsFile
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.continual import is_continual, require_continual

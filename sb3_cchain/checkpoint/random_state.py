@@ -1,7 +1,8 @@
 """The state of the global generators of random numbers of a process."""
 
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -29,3 +30,18 @@ def restore_random_state(state: Mapping[str, Any], device: th.device | None = No
     th.set_rng_state(state["torch"])
     if device is not None and device.type == "cuda":
         th.cuda.set_rng_state(state["cuda"], device)
+
+
+@contextmanager
+def unchanged_random_state() -> Iterator[None]:
+    """
+    Random numbers that are drawn inside the ``with`` block from the global generators, as replay buffers, networks and some
+    environments do, leave no trace: training goes on with the numbers that it would have drawn without them.
+    """
+    state = random_state()
+    try:
+        # Of all GPUs
+        with th.random.fork_rng(range(th.cuda.device_count()) if th.cuda.is_initialized() else []):
+            yield
+    finally:
+        restore_random_state(state)

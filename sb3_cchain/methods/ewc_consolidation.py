@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.analysis.random_state import unchanged_random_state
+from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.methods.ewc import EWC
 from sb3_cchain.methods.optimizer_wrapper import nested_wrappers
 from sb3_cchain.networks.compiled import uncompiled
