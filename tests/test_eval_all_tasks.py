@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import RecordEpisodeStatistics, TransformAction
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
@@ -16,7 +17,7 @@ from sb3_cchain import CChainPPO, ContinualEnv, TaskSignal, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, task_evaluation
 from sb3_cchain.analysis.eval_all_tasks import read_task_returns
 from sb3_cchain.analysis.metrics.continual import return_matrix
-from sb3_cchain.envs import TaskVecNormalize
+from sb3_cchain.envs import RewardScale, TaskVecNormalize
 from sb3_cchain.methods import Oracle
 from sb3_cchain.tensorboard.layout import layout_of
 from tests.envs import CountEnv, RandomEnv
@@ -137,6 +138,29 @@ def test_the_environment_is_made_like_that_of_training():
     assert made.get_attr("task_sequence") == env.get_attr("task_sequence", 0)
     assert isinstance(made, VecNormalize) and not made.training
     assert np.array_equal(made.obs_rms.mean, env.obs_rms.mean)
+    assert {row["mean_return"] for row in model.task_returns} == {-20.0}
+
+
+def other_action(action):
+    return 1 - action
+
+
+def flipped(env):
+    return TransformAction(env, other_action, env.action_space)
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_wrappers_that_an_evaluation_would_lack_are_refused(vec_env_cls):
+    env = make_vec_env("Continual/CartPole-v1", 1, env_kwargs=CARTPOLE, wrapper_class=flipped, vec_env_cls=vec_env_cls)
+    with pytest.raises(ValueError, match=r"is wrapped in TransformAction, which may change .* an `eval_env` with"):
+        PPO("MlpPolicy", env, **ARGUMENTS).learn(1, callback=[TaskSync(), EvalAllTasks()])
+    env.close()
+
+
+def test_wrappers_of_rewards_and_statistics_make_no_difference():
+    env = RecordEpisodeStatistics(RewardScale(gym.make("Continual/Acrobot-v1", **CARTPOLE, max_episode_steps=20), 0.1))
+    model = PPO("MlpPolicy", env, **ARGUMENTS)
+    model.learn(16, callback=[TaskSync(), EvalAllTasks(n_eval_episodes=1)])
     assert {row["mean_return"] for row in model.task_returns} == {-20.0}
 
 

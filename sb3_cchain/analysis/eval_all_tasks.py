@@ -41,7 +41,7 @@ class EvalAllTasks(TaskEvaluation):
 
     :param eval_env: The environment to evaluate in, wrapped as that of training and with the same tasks; one that is not
         vectorised will do. None makes one like the training environment, if that was made by :func:`gymnasium.make` (as RL Zoo
-        does) and its wrappers leave the observations as they are
+        does) and the wrappers around it are those of rewards, videos and statistics
     :param n_eval_episodes: Episodes per task
     :param interval: Environment steps between evaluations besides those at switches; None for none
     :param deterministic: Whether to take the policy's most likely action

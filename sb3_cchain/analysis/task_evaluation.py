@@ -11,14 +11,18 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
+from gymnasium import spaces, wrappers
+from gymnasium.envs.registration import WrapperSpec, load_env_creator
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_cchain.callbacks.log_folder import log_path
 from sb3_cchain.callbacks.returns_file import ReturnsFile
 from sb3_cchain.checkpoint.random_state import unchanged_random_state
+from sb3_cchain.checkpoint.resumable_env import ResumableEnv
+from sb3_cchain.envs import TaskCaption
 from sb3_cchain.masked_evaluation import evaluate_policy
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.continual import is_continual, require_continual
@@ -28,6 +32,18 @@ from sb3_cchain.tasks.single_envs import share_envs
 from sb3_cchain.tasks.sync import warn_without_sync
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool, check_number, check_path
+
+# Wrappers that change neither observations nor actions, nor the length of episodes
+NEEDLESS = (
+    gym.RewardWrapper,
+    wrappers.HumanRendering,
+    wrappers.NormalizeReward,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    Monitor,
+    ResumableEnv,
+    TaskCaption,
+)
 
 # Steps of an episode after which a warning says that it may never end
 LONG_EPISODE = 100_000
@@ -210,6 +226,12 @@ def _make_eval_env(model: BaseAlgorithm) -> VecEnv:
     spec = training_env.get_attr("spec", indices=0)[0]
     if spec is None:
         raise ValueError("The training environment was not made by gymnasium.make(): give the callback an `eval_env`")
+    lost = [wrapper.name for wrapper in spec.additional_wrappers if not _is_needless(wrapper)]
+    if lost:
+        raise ValueError(
+            f"The training environment is wrapped in {', '.join(lost)}, which may change what the agent sees or does. Give "
+            "the callback an `eval_env` with the same wrappers, or wrap each task inside the continual environment"
+        )
     env = model._wrap_env(gym.make(replace(spec, additional_wrappers=())), verbose=0)
     normalize = model.get_vec_normalize_env()
     if normalize is None:
@@ -223,6 +245,15 @@ def _make_eval_env(model: BaseAlgorithm) -> VecEnv:
         epsilon=normalize.epsilon,
         norm_obs_keys=normalize.norm_obs_keys,
     )
+
+
+def _is_needless(wrapper: WrapperSpec) -> bool:
+    """Whether an evaluation is the same without a wrapper, since it counts the environment's own rewards."""
+    try:
+        wrapper_class = load_env_creator(wrapper.entry_point)
+    except (ImportError, AttributeError):  # a class inside a function
+        return False
+    return isinstance(wrapper_class, type) and issubclass(wrapper_class, NEEDLESS)
 
 
 @contextmanager
