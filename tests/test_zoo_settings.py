@@ -13,8 +13,16 @@ from stable_baselines3 import DQN, PPO
 from benchmarks.grid.run import suite_methods
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
 from sb3_cchain.envs.registration import CONTINUAL_ENVS, OTHER_ENVS
+from sb3_cchain.methods import UPGD
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY
-from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, base_algo, hyperparams_folder, settings_file
+from sb3_cchain.zoo.settings import (
+    SettingsLoader,
+    add_settings_file,
+    base_algo,
+    hyperparams_folder,
+    missing_parts,
+    settings_file,
+)
 from tests.envs import RandomEnv
 from tests.extras import NO_WHEELS
 from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, SHORT_PPO, command, shipped_settings
@@ -318,6 +326,44 @@ def test_a_method_without_a_yaml_file_says_so(monkeypatch, tmp_path):
 def test_the_file_of_the_user_for_a_method():
     arguments = ["--algo", "ppo_redo", "--env", "CartPole-v1", "-conf", "mine.yml"]
     assert add_settings_file(arguments) == arguments
+
+
+# All parts of a method, without what only logs
+PARTS = {
+    "ppo_trac": ["TRAC"],
+    "ppo_redo": ["ReDo"],
+    "ppo_layer_norm": ["LayerNormPolicy"],
+    "ppo_ewc": ["EWCConsolidation", "EWC"],
+    "ppo_normalize_and_project": ["NormalizeAndProject", "LayerNormPolicy"],
+    "ppo_plasticity_injection": ["PlasticityInjection", "InjectionPolicy"],
+    "ppo_cchain": [],
+}
+
+
+@pytest.mark.parametrize("algo, parts", PARTS.items())
+def test_what_settings_lack_of_a_method_is_found(algo, parts):
+    method = BY_ALGO[algo]
+    assert missing_parts(method, {"policy": "MlpPolicy"}, []) == parts
+    assert missing_parts(method, {"policy": "MlpPolicy", "policy_kwargs": {"features_extractor_class": object}}, []) == [
+        part for part in parts if not part.endswith("Policy")
+    ]
+    there = {"policy": method.policy, "policy_kwargs": {"optimizer_class": method.optimizer_class}}
+    callbacks = [callback() for callback in method.callbacks]
+    assert missing_parts(method, there, callbacks) == []
+    # An optimiser inside of others
+    inside = {"optimizer_class": UPGD, "optimizer_kwargs": {"base_class": method.optimizer_class, "base_kwargs": None}}
+    assert missing_parts(method, {**there, "policy_kwargs": inside}, callbacks) == []
+
+
+def test_a_file_of_the_user_without_the_method_is_refused(tmp_path):
+    file, logs = tmp_path / "mine.yml", tmp_path / "logs"
+    file.write_text("CartPole-v1:\n  policy: MlpPolicy\n  n_timesteps: 64\n  n_steps: 32\n")
+    with pytest.raises(
+        SystemExit, match=r"ppo_trac: the settings of CartPole-v1 in .*mine\.yml lack TRAC, .*ppo_trac\.yml"
+    ):
+        train(logs, "ppo_trac", "CartPole-v1", 64, "-conf", file)
+    assert not logs.exists()
+    train(logs, "ppo_cchain", "CartPole-v1", 64, "-conf", file)
 
 
 # --- What RL Zoo saved beside a model -------------------------------------------------------------------------------------

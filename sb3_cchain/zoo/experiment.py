@@ -39,6 +39,7 @@ from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
+from sb3_cchain.zoo.settings import missing_parts, settings_path
 from sb3_cchain.zoo.statistics import statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
 from sb3_cchain.zoo.training_record import differences, plain, write_record
@@ -97,6 +98,17 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             hyperparams, saved = super().read_hyperparameters()
         self._hyperparameters_read = plain(saved)  # what follows changes parts of them in place
         return hyperparams, saved
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple[Any, ...]:
+        processed = super()._preprocess_hyperparams(hyperparams)
+        hyperparams, _, callbacks, _ = processed
+        method = BY_ALGO.get(self.algo)
+        if method is not None and (missing := missing_parts(method, hyperparams, callbacks)):
+            sys.exit(
+                f"{self.algo}: the settings of {self.env_name} in {self.config} lack {' and '.join(missing)}, without which "
+                f"they are not those of the method. {settings_path(self.algo)} shows how to name it"
+            )
+        return processed
 
     def load_trial(self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> dict[str, Any]:
         """

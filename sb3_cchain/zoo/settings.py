@@ -3,11 +3,14 @@
 import argparse
 import sys
 from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cchain.methods import OptimizerMetrics
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 
 
@@ -20,12 +23,20 @@ def hyperparams_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "zoo_hyperparams"
 
 
+def settings_path(algo: str) -> Path:
+    """
+    :param algo: Name of the algorithm on the command line
+    :return: Where its YAML file is, if it has one
+    """
+    return hyperparams_folder() / f"{algo}.yml"
+
+
 def read_settings(algo: str) -> dict[str, Any]:
     """
     :param algo: Name of the algorithm on the command line
     :return: The content of its YAML file; empty if there is none
     """
-    path = hyperparams_folder() / f"{algo}.yml"
+    path = settings_path(algo)
     return yaml.safe_load(path.read_text()) if path.is_file() else {}
 
 
@@ -38,7 +49,7 @@ def settings_file(algo: str, env_id: str) -> Path | None:
     """
     settings = read_settings(algo)
     if env_id in settings or ("default" in settings and not _rl_zoo_has_settings(algo)):
-        return hyperparams_folder() / f"{algo}.yml"
+        return settings_path(algo)
     return None
 
 
@@ -77,7 +88,7 @@ def add_settings_file(arguments: list[str]) -> list[str]:
         has = f"only for {', '.join(covered)}" if covered else "and for no other"
         sys.exit(
             f"{given.algo}.yml has no settings for {given.env}, {has}. "
-            "For another environment, give a YAML file of your own: -conf FILE"
+            "For another environment, give a YAML file of your own that names the method, too: -conf FILE"
         )
     return arguments
 
@@ -88,6 +99,34 @@ def base_algo(method: Method) -> str:
     :return: Name of its algorithm on the command line, without the method
     """
     return next(row.algo for row in REGISTRY if row.algorithm is method.algorithm and not row.is_related)
+
+
+def missing_parts(method: Method, hyperparams: Mapping[str, Any], callbacks: Sequence[BaseCallback]) -> list[str]:
+    """
+    :param method: A method
+    :param hyperparams: Hyperparameters of its algorithm
+    :param callbacks: Callbacks of the settings
+    :return: Names of the classes that make the method and that the settings lack: its optimiser, its callbacks, and its policy
+        where the settings have one of Stable-Baselines3's with its usual features extractor
+    """
+    policy, policy_kwargs = hyperparams.get("policy"), hyperparams.get("policy_kwargs") or {}
+    # Callbacks that only log are no part of a method
+    parts: list[type] = [callback for callback in method.callbacks if callback is not OptimizerMetrics]
+    if method.optimizer_class is not None:
+        parts.append(method.optimizer_class)
+    there = [*map(type, callbacks), *_optimizer_classes(policy_kwargs)]
+    missing = [part.__name__ for part in parts if not any(issubclass(each, part) for each in there)]
+    if isinstance(method.policy, type) and isinstance(policy, str) and "features_extractor_class" not in policy_kwargs:
+        missing.append(method.policy.__name__)
+    return missing
+
+
+def _optimizer_classes(policy_kwargs: Mapping[str, Any]) -> Iterator[type]:
+    """The optimiser of a policy, and those inside of it."""
+    name, kwargs = "optimizer", policy_kwargs
+    while isinstance(optimizer_class := kwargs.get(f"{name}_class"), type):
+        yield optimizer_class
+        name, kwargs = "base", kwargs.get(f"{name}_kwargs") or {}
 
 
 class SettingsLoader(yaml.FullLoader):
