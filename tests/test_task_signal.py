@@ -392,6 +392,16 @@ def test_the_next_switch(arguments, step, expected):
     assert signal.next_switch == expected
 
 
+@pytest.mark.parametrize("arguments", [dict(switch_every=20), dict(switch_at=[20, 40, 60])], ids=["every", "at"])
+def test_the_last_rollout_begins_no_task(arguments):
+    """Its 16 steps end at step 48."""
+    model, metrics = make_model("PPO", CountEnv()), ContinualMetrics()
+    model.learn(40, [TaskSignal(**arguments), metrics])
+    assert [(row["timesteps"], row["task_id"]) for row in metrics.rows] == [(16, 0), (32, 1), (48, 1)]
+    model.learn(12, [TaskSignal(**arguments), metrics], reset_num_timesteps=False)
+    assert [(row["timesteps"], row["task_id"]) for row in metrics.rows[3:]] == [(64, 2)]
+
+
 def test_a_training_that_begins_anew_begins_with_task_0():
     model, signal = make_model("PPO", CountEnv()).learn(32, TaskSignal(switch_at=[16])), TaskSignal()
     model.learn(16, signal)

@@ -42,7 +42,8 @@ class TaskSignal(BaseCallback):
       values may be of any type. By default ``"task_id"``, which may be absent.
     - ``attribute``: it is an attribute of the environment or of a wrapper, and is read after each step. In ``SubprocVecEnv``
       that costs a message to the process per step; ``key`` costs nothing.
-    - ``switch_every``, ``switch_at``: tasks begin after so many environment steps.
+    - ``switch_every``, ``switch_at``: tasks begin after so many environment steps. A task that would begin at the end of
+      ``learn()`` or in what its last rollout adds to ``total_timesteps`` begins with the next ``learn()``.
     - ``drift``: nobody says so, and a detector finds out. ``"adwin"`` is ADWIN of the package ``river``
       (https://doi.org/10.1137/1.9781611972771.42, Bifet & Gavaldà, 2007), which compares the older with the newer values of
       a window, of any length, and cuts it where their means differ. It is a switch when the newer values are worse: smaller
@@ -178,10 +179,12 @@ class TaskSignal(BaseCallback):
         if self.attribute is not None:
             # A copy: the environment may change it in place
             reports["attribute"] = deepcopy(self.training_env.get_attr(self.attribute, indices=0)[0])
+        # The last rollout goes beyond the steps that were asked for, and begins no task there
+        step = min(self.num_timesteps, self.model._total_timesteps - 1)
         if self.switch_every is not None:
-            reports["schedule"] = self.num_timesteps // self.switch_every
+            reports["schedule"] = step // self.switch_every
         if self.switch_at is not None:
-            reports["schedule"] = bisect_right(self.switch_at, self.num_timesteps)
+            reports["schedule"] = bisect_right(self.switch_at, step)
         return reports
 
     def _hear(self, *reports: dict[str, Any]) -> bool:
