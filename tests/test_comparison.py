@@ -157,6 +157,49 @@ def test_a_shorter_run_is_named(tmp_path, capsys):
     assert re.search(r"\| 0 +\| +2 \|", output) and not re.search(r"\n\| 1 ", output)
 
 
+@pytest.mark.parametrize(
+    "tasks, ends",
+    [
+        (([1.0] * 12, [2.0] * 8), "1,200, 2,000"),
+        (([1.0] * 20,), "2,000"),
+        (([1.0] * 10, [2.0] * 5, [3.0] * 5), "1,000, 1,500, 2,000"),
+        (([1.0] * 11, [2.0] * 9), None),  # a rollout later
+        (([1.0] * 10, [2.0] * 5), None),  # shorter
+        (([1.0] * 9,), None),
+    ],
+)
+def test_tasks_that_end_elsewhere_are_named(tasks, ends, tmp_path, capsys):
+    first = write(tmp_path / "a.csv", run_with([1.0] * 10, [2.0] * 10)).resolve()
+    other = write(tmp_path / "b.csv", run_with(*tasks)).resolve()
+    command("compare", "-r", "a", first, "-r", "b", other)
+    line = f"Other tasks: those of {other} end at step {ends}, those of {first} at 1,000, 2,000. Tasks of the same"
+    output = capsys.readouterr().out
+    assert (line in output) if ends else ("Other tasks" not in output)
+
+
+def endless(*tasks):
+    """Rows of a run in which no episode ended."""
+    return [{**row, "n_episodes": 0} for row in run_with(*tasks)]
+
+
+def test_rewards_per_step_are_not_compared_with_returns(tmp_path, capsys):
+    collapsed = run_with([-50.0], [-50.0])[:1] + endless([-50.0], [-1.0])[1:]
+    a, b = write(tmp_path / "a.csv", run_with([-40.0], [-30.0])), write(tmp_path / "b.csv", collapsed)
+    command("compare", "-r", "a", a, "-r", "b", b)
+    output = capsys.readouterr().out
+    assert "Left out: task 1, because not all runs have ended an episode in it" in output
+    assert re.search(r"\| J\(T\) +\| +-40 \| +-50 \|", output) and not re.search(r"\n\| 1 ", output)
+    lines = draw_comparison({"a": [run_with([-40.0], [-30.0])], "b": [collapsed]}, window=1).axes[0].get_lines()
+    assert [value for line in lines for value in line.get_ydata() if len(line.get_ydata()) == 1] == [-40, -50]
+
+
+def test_rewards_per_step_are_compared_with_each_other():
+    table = comparison_table({"a": [endless([-1.0])], "b": [endless([-0.5])]})
+    assert ["J(T)", "-1", "-0.5"] in cells(table)
+    with pytest.raises(ValueError, match=r"the tasks \[0\]; \[0\]; in 0 not all runs have ended an episode"):
+        comparison_table({"a": [endless([-1.0])], "b": [run_with([-0.5])]})
+
+
 def test_seeds_that_are_alike_all_count(tmp_path, capsys):
     """Such as those that have collapsed to the worst return. Labels are taken as they are."""
     for seed, last in enumerate((-400.0, -400.0, -100.0)):

@@ -358,9 +358,7 @@ def test_what_settings_lack_of_a_method_is_found(algo, parts):
 def test_a_file_of_the_user_without_the_method_is_refused(tmp_path):
     file, logs = tmp_path / "mine.yml", tmp_path / "logs"
     file.write_text("CartPole-v1:\n  policy: MlpPolicy\n  n_timesteps: 64\n  n_steps: 32\n")
-    with pytest.raises(
-        SystemExit, match=r"ppo_trac: the settings of CartPole-v1 in .*mine\.yml lack TRAC, .*ppo_trac\.yml"
-    ):
+    with pytest.raises(SystemExit, match=r"ppo_trac: the settings of CartPole-v1 in .*mine\.yml lack TRAC, .*ppo_trac\.yml"):
         train(logs, "ppo_trac", "CartPole-v1", 64, "-conf", file)
     assert not logs.exists()
     train(logs, "ppo_cchain", "CartPole-v1", 64, "-conf", file)

@@ -1,5 +1,6 @@
 """Methods side by side, by the returns of their runs over the same tasks: a table, and learning curves."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -24,25 +25,42 @@ Rows = Sequence[Mapping[str, float]]
 Methods = Mapping[str, Sequence[Rows]]
 
 
+def mixed_tasks(methods: Methods) -> list[int]:
+    """
+    :param methods: By label, the rows of ``returns.csv`` of each run
+    :return: The tasks in which no episode ended in some of the runs, but in others. The return of the former is a reward per
+        step, which is not to be compared with returns of episodes
+    """
+    with_episodes: dict[int, set[bool]] = defaultdict(set)
+    for runs in methods.values():
+        for rows in runs:
+            for row in rows:
+                with_episodes[int(row["task_id"])].add(row["n_episodes"] > 0)
+    return sorted(task for task, kinds in with_episodes.items() if len(kinds) > 1)
+
+
 def common_tasks(methods: Methods) -> list[int]:
     """
     :param methods: By label, the rows of ``returns.csv`` of each run
-    :return: The tasks that all runs have returns on, in their order
+    :return: The tasks that all runs have comparable returns on, in their order
     :raises ValueError: When there is none
     """
     tasks = [list(dict.fromkeys(int(row["task_id"]) for row in rows)) for runs in methods.values() for rows in runs]
-    common = [task for task in tasks[0] if all(task in others for others in tasks)]
+    mixed = mixed_tasks(methods)
+    common = [task for task in tasks[0] if task not in mixed and all(task in others for others in tasks)]
     if not common:
-        raise ValueError(f"The runs must have a task in common; got the tasks {'; '.join(map(str, tasks))}")
+        without = f"; in {', '.join(map(str, mixed))} not all runs have ended an episode" if mixed else ""
+        raise ValueError(f"The runs must have a task in common; got the tasks {'; '.join(map(str, tasks))}{without}")
     return common
 
 
 def comparison_table(methods: Methods) -> Table:
     r"""
     :param methods: By label, the rows of ``returns.csv`` of each run; differences are from the first
-    :return: For each method the number of runs, the mean return on each task that all runs have, and :math:`J(\mathbb{T})`,
-        their mean: its mean over the runs with its 95 % interval, by Student's t, and how much more it is than that of the
-        first method, by Welch's t-test. There are no intervals for a single run, or where all runs are alike
+    :return: For each method the number of runs, the mean return on each of the :func:`common_tasks`, and
+        :math:`J(\mathbb{T})`, their mean: its mean over the runs with its 95 % interval, by Student's t, and how much more it
+        is than that of the first method, by Welch's t-test. There are no intervals for a single run, or where all runs are
+        alike
     :raises ValueError: When the runs have no task in common
     :raises ImportError: Without SciPy
     """
@@ -77,16 +95,17 @@ def _interval_text(interval: tuple[float, float] | None) -> str:
 def draw_comparison(methods: Methods, window: int) -> "Figure":
     """
     Draw returns against environment steps: of each method a line for the mean over its runs, and a band of its standard error;
-    dashed lines where the task switches.
+    dashed lines where the task switches. The :func:`mixed_tasks` are left out.
 
     :param methods: By label, the rows of ``returns.csv`` of each run
     :param window: Rows that the running mean goes over, inside a task
     :return: The picture
     :raises ImportError: Without matplotlib
     """
+    mixed = mixed_tasks(methods)
     with new_figure(9, 4) as figure:
         axes = figure.add_subplot()
-        curves = {label: [_curves(rows, window) for rows in runs] for label, runs in methods.items()}
+        curves = {label: [_curves(rows, window, mixed) for rows in runs] for label, runs in methods.items()}
         for number, (label, runs) in enumerate(curves.items()):
             name: str | None = f"{label}, {len(runs)} run{'s' * (len(runs) > 1)}"
             for curves_in_task in zip(*runs, strict=False):  # as many tasks as all runs have reached
@@ -105,9 +124,11 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
     return figure
 
 
-def _curves(rows: Rows, window: int) -> list[Series]:
+def _curves(rows: Rows, window: int, left_out: Sequence[int]) -> list[Series]:
     """The curve of each task, in the order of training; a task that comes back has several."""
-    tasks = [list(rows_of_task) for _, rows_of_task in groupby(rows, key=lambda row: row["task_id"])]
+    tasks = [
+        list(rows_of_task) for task, rows_of_task in groupby(rows, key=lambda row: row["task_id"]) if task not in left_out
+    ]
     return [
         (np.array([row["timesteps"] for row in each]), smoothed(np.array([row["mean_return"] for row in each]), window))
         for each in tasks

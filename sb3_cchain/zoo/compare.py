@@ -2,11 +2,12 @@
 
 import argparse
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from rich.console import Console
 
-from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison
+from sb3_cchain.analysis.comparison import Rows, comparison_table, draw_comparison, mixed_tasks
 from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV, read_returns
 from sb3_cchain.zoo.outputs import check_output_file, print_line
@@ -53,7 +54,11 @@ def main(arguments: Sequence[str]) -> None:
     try:
         methods = {label: read_runs(paths, console) for label, *paths in args.runs}
         print_lengths(methods, console)
+        print_switches(methods, console)
         returns = {label: list(runs.values()) for label, runs in methods.items()}
+        for task in mixed_tasks(returns):
+            why = "not all runs have ended an episode in it, so some returns would be rewards per step"
+            print_line(console, f"Left out: task {task}, because {why}")
         console.print(comparison_table(returns))
         if args.output is not None:
             draw_comparison(returns, args.window).savefig(args.output)
@@ -130,3 +135,36 @@ def print_lengths(methods: dict[str, dict[Path, Rows]], console: Console) -> Non
                 f"Shorter: {file} ends at step {end:,} of {longest:,}. The tasks that all runs have are compared, the last of "
                 "them perhaps in part",
             )
+
+
+def print_switches(methods: dict[str, dict[Path, Rows]], console: Console) -> None:
+    """
+    Name the runs whose tasks switched at other steps than those of the first run, as where switches are detected.
+
+    :param methods: The rows of each run, by label and file
+    :param console: Where
+    """
+    runs = {file: rows for of_method in methods.values() for file, rows in of_method.items()}
+    ends = {file: _ends_of_tasks(rows) for file, rows in runs.items()}
+    tolerance = (1 - SHORT) * max(steps[-1] for steps in ends.values())
+    first, *others = ends
+    for file in others:
+        a, b = ends[first], ends[file]
+        both_run_until = min(a[-1], b[-1]) - tolerance
+        n = min(len(a), len(b)) - 1
+        only_in_one = [end for end in (*a[n:-1], *b[n:-1]) if end < both_run_until]
+        if only_in_one or any(abs(x - y) > tolerance for x, y in zip(a[:n], b[:n], strict=True)):
+            print_line(
+                console,
+                f"Other tasks: those of {file} end at step {_listed(b)}, those of {first} at {_listed(a)}. Tasks of the same "
+                "number are not of the same steps",
+            )
+
+
+def _listed(steps: Sequence[int]) -> str:
+    return ", ".join(f"{step:,}" for step in steps)
+
+
+def _ends_of_tasks(rows: Rows) -> list[int]:
+    """Environment steps of the last row of each task, in the order of training."""
+    return [int(list(of_task)[-1]["timesteps"]) for _, of_task in groupby(rows, key=lambda row: row["task_id"])]
