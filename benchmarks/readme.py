@@ -55,9 +55,9 @@ def readme_table(cells: Cells) -> str:
         done = [cell for cell in here if cell is not None]
         figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
         lengths = f"{done[0].results[0].n_tasks} × {done[0].results[0].steps_per_task // 1000} 000"
-        seeds = ", ".join(sorted({" ".join(map(str, cell.seeds)) for cell in done}))
+        n_seeds = ", ".join(map(str, sorted({len(cell.seeds) for cell in done})))
         printed = [f"{figure.mean:.0f} ± {figure.standard_error:.0f}" for figure in figures]
-        rows.append([short_name(env_id), lengths, seeds, *map(_score, here), *printed])
+        rows.append([short_name(env_id), lengths, n_seeds, *map(_score, here), *printed])
     labels = [method_label(SUITE, method) for method in METHODS]
     header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
     counts = {
