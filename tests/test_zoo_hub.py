@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import gymnasium as gym
 import huggingface_hub
 import numpy as np
 import pytest
@@ -102,6 +103,26 @@ def test_the_model_card_names_our_commands(hub):
     assert result["name"] == "CChainPPO" and np.isfinite(float(result["results"][0]["metrics"][0]["value"].split()[0]))
 
 
+def test_an_environment_of_ones_own(hub, tmp_path, monkeypatch):
+    (tmp_path / "grid_of_a_user.py").write_text(
+        "import gymnasium as gym\n\n"
+        "gym.register('MyGrid-v0', 'gymnasium.envs.classic_control:CartPoleEnv', max_episode_steps=9)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    gym.register("MyGrid-v0", "gymnasium.envs.classic_control:CartPoleEnv", max_episode_steps=9)
+    of = ("--algo", "ppo_cchain", "--env", "MyGrid-v0")
+    (tmp_path / "own.yml").write_text("MyGrid-v0:\n  policy: MlpPolicy\n  n_timesteps: 32\n")
+    command("train", *of, "-conf", "own.yml", "-f", "logs", *FAST, *NO_EVALUATION, *SHORT_PPO)
+    # As in the new process of another command
+    monkeypatch.delitem(gym.registry, "MyGrid-v0")
+    packages = ("--gym-packages", "grid_of_a_user")
+    command("push_to_hub", *of, *packages, "-f", "logs", "-orga", "me", "--no-render", "--device", "cpu")
+    card = (hub / "me" / "ppo_cchain-MyGrid-v0" / "README.md").read_text()
+    assert "\nsb3-cchain enjoy --algo ppo_cchain --env MyGrid-v0  -f logs/ --gym-packages grid_of_a_user\n" in card
+    command("load_from_hub", *of, "-f", "loaded", "-orga", "me", *packages)
+    assert Path("loaded", "ppo_cchain", "MyGrid-v0_1", "MyGrid-v0.zip").is_file()
+
+
 def test_loading_needs_trust(hub, monkeypatch):
     monkeypatch.delenv("TRUST_REMOTE_CODE")
     with pytest.raises(ValueError, match="TRUST_REMOTE_CODE"):
@@ -113,4 +134,5 @@ def test_the_hub_commands_know_our_names(name, capsys):
     with pytest.raises(SystemExit) as exit_info:
         command(name, "--help")
     assert exit_info.value.code == 0
-    assert "dqn_cchain" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "dqn_cchain" in output and "--gym-packages" in output

@@ -7,7 +7,7 @@ import runpy
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any
@@ -31,6 +31,7 @@ from sb3_cchain.zoo import compare
 from sb3_cchain.zoo import inspect as zoo_inspect
 from sb3_cchain.zoo.checkpoint_options import find_resumed, make_parser, take_options
 from sb3_cchain.zoo.experiment import ExperimentManager
+from sb3_cchain.zoo.gym_packages import take_gym_packages
 from sb3_cchain.zoo.hub import working_clients
 from sb3_cchain.zoo.playing import Playing
 from sb3_cchain.zoo.search import register_search_spaces
@@ -58,12 +59,13 @@ def register_algorithms(playing: Playing | None = None) -> None:
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
 
 
-def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
+def call_sb3_cchain(command: list[str], *args: Any, gym_packages: Sequence[str] = (), **kwargs: Any) -> int:
     """
     What ``subprocess.call`` is to RL Zoo's ``record_training`` and ``benchmark``, which start others of RL Zoo's commands.
 
     :param command: A command and its arguments
     :param args: Other arguments of ``subprocess.call``
+    :param gym_packages: Packages that the command imports
     :param kwargs: Other arguments of ``subprocess.call``
     :return: Exit code
     """
@@ -72,6 +74,8 @@ def call_sb3_cchain(command: list[str], *args: Any, **kwargs: Any) -> int:
     for stock, name in ((["python", "-m", "rl_zoo3.record_video"], "record_video"), (["python", "enjoy.py"], "enjoy")):
         if command[: len(stock)] == stock:
             command = [sys.executable, "-m", "sb3_cchain.zoo", name, *command[len(stock) :]]
+            if gym_packages:
+                command += ["--gym-packages", *gym_packages]
     return subprocess.run(command, *args, **kwargs).returncode
 
 
@@ -165,12 +169,13 @@ def run_script(name: str) -> None:
 
 def run_module(name: str, playing: Playing) -> None:
     """
-    Run a module of RL Zoo's as ``python -m`` does, with the algorithms registered.
+    Run a module of RL Zoo's as ``python -m`` does, with the algorithms registered, and with ``--gym-packages``.
 
     :param name: Its name, which ``sys.argv[1]`` is as well
     :param playing: Makes its environment
     """
     del sys.argv[1]
+    gym_packages, sys.argv[1:] = take_gym_packages(name, sys.argv[1:])
     get_trained_models = rl_zoo3.utils.get_trained_models
 
     def get_trained_models_by_name(log_folder: str) -> dict[str, tuple[str, str]]:
@@ -179,10 +184,10 @@ def run_module(name: str, playing: Playing) -> None:
 
     create_env = playing.create_captioned_env if name == "record_video" else playing.create_env
     with (
-        replaced(subprocess, "call", call_sb3_cchain),
+        replaced(subprocess, "call", partial(call_sb3_cchain, gym_packages=gym_packages)),
         replaced(rl_zoo3.utils, "get_trained_models", get_trained_models_by_name),
         replaced(rl_zoo3.utils, "create_test_env", create_env),
-        working_clients() if name.endswith("_hub") else nullcontext(),
+        working_clients(gym_packages) if name.endswith("_hub") else nullcontext(),
         warnings.catch_warnings(),
     ):
         # enjoy has imported load_from_hub before

@@ -1,7 +1,9 @@
 """RL Zoo's commands for the Hugging Face Hub, with the clients that are installed."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from sb3_cchain.replaced import replaced
 
 
 @contextmanager
-def working_clients() -> Iterator[None]:
+def working_clients(gym_packages: Sequence[str] = ()) -> Iterator[None]:
     """
     Inside the ``with`` block RL Zoo's modules ``push_to_hub`` and ``load_from_hub`` find what they expect of the clients, some
     of which newer clients have changed:
@@ -25,13 +27,17 @@ def working_clients() -> Iterator[None]:
       model without normalisation.
 
     And the model card names the commands of this package, which know its algorithms.
+
+    :param gym_packages: Packages that the commands on the card import
     """
     push = import_module("huggingface_sb3.push_to_hub")  # the function of that name hides the module
     with ExitStack() as stack:
         if not hasattr(push, "generate_metadata"):
             stack.enter_context(replaced(push, "generate_metadata", push._generate_metadata))
         stack.enter_context(replaced(huggingface_sb3, "load_from_hub", _load_from_hub))
-        stack.enter_context(replaced(huggingface_hub.repocard, "metadata_save", _save_card))
+        stack.enter_context(
+            replaced(huggingface_hub.repocard, "metadata_save", partial(_save_card, gym_packages=gym_packages))
+        )
         yield
 
 
@@ -45,9 +51,11 @@ def _load_from_hub(repo_id: str, filename: str) -> str:
         raise HTTPError(str(error)) from error
 
 
-def _save_card(path: Path, metadata: Any) -> None:
+def _save_card(path: Path, metadata: Any, gym_packages: Sequence[str]) -> None:
     card = path.read_text(encoding="utf-8")
     for stock, name in (("pip install rl_zoo3", 'pip install "sb3-cchain[zoo]"'), ("python -m rl_zoo3.", "sb3-cchain ")):
         card = card.replace(stock, name)
+    if gym_packages:
+        card = re.sub("^sb3-cchain .*", rf"\g<0> --gym-packages {' '.join(gym_packages)}", card, flags=re.MULTILINE)
     path.write_text(card, encoding="utf-8")
     _save_metadata(path, metadata if isinstance(metadata, dict) else metadata.to_dict())

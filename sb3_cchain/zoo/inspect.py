@@ -1,7 +1,6 @@
 """The command ``sb3-cchain inspect``."""
 
 import argparse
-import importlib
 import json
 import math
 import sys
@@ -22,6 +21,7 @@ from sb3_cchain.analysis.inspection_report import findings_text, plot, report
 from sb3_cchain.analysis.report_page import html_report
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.zoo.as_trained import load_as_trained
+from sb3_cchain.zoo.gym_packages import add_gym_packages, import_gym_packages
 from sb3_cchain.zoo.outputs import check_output_file, check_output_folder, print_line
 
 
@@ -39,9 +39,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("models", nargs="+", type=Path, metavar="MODEL.zip", help="One saved model, or two to compare")
     parser.add_argument("--env", required=True, help="Environment id")
-    parser.add_argument(
-        "--gym-packages", nargs="+", default=[], metavar="PACKAGE", help="Packages to import that register environments"
-    )
+    add_gym_packages(parser)
     parser.add_argument(
         "--env-kwargs",
         nargs="+",
@@ -121,11 +119,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = make_parser()
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
-    for package in args.gym_packages:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            parser.error(f"--gym-packages {package}: {error}")
+    import_gym_packages(parser, args.gym_packages)
     names = ["A", "B"] if len(args.models) == 2 else [args.models[0].stem]
     console = Console(stderr=args.json)
     # RL Zoo prints how it makes an environment
