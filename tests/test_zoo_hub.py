@@ -1,6 +1,7 @@
 """The commands for the Hugging Face Hub, with a folder in the place of the hub."""
 
 import shutil
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -96,11 +97,26 @@ def test_the_model_card_names_our_commands(hub):
     card = (hub / "me" / "ppo_cchain-Continual-CartPole-v1" / "README.md").read_text()
     assert "**CChainPPO** Agent playing **Continual/CartPole-v1**" in card
     assert "\nsb3-cchain load_from_hub --algo ppo_cchain --env Continual/CartPole-v1 -orga me -f logs/\n" in card
-    assert "rl_zoo3." not in card and 'pip install "sb3-cchain[zoo]"' in card
+    assert "rl_zoo3" not in card and '\npip install ".[zoo]"\n' in card
+    assert "https://arxiv.org/abs/2506.00592" in card
     metadata = yaml.safe_load(card.split("---")[1])
     assert metadata["library_name"] == "stable-baselines3" and "Continual/CartPole-v1" in metadata["tags"]
     (result,) = metadata["model-index"]
     assert result["name"] == "CChainPPO" and np.isfinite(float(result["results"][0]["metrics"][0]["value"].split()[0]))
+
+
+def test_the_model_card_says_what_was_evaluated(hub, monkeypatch):
+    of = ("--algo", "ppo_cchain", "--env", "Continual/CartPole-v1")
+    command("train", *of, "-n", "32", "-f", "logs", *FAST, *NO_EVALUATION, *SHORT_PPO)
+    evaluated = []
+    push = import_module("huggingface_sb3.push_to_hub")  # the function of that name hides the module
+    monkeypatch.setattr(push, "_evaluate_agent", lambda _, env, *args: evaluated.append(env.get_attr("task_id")) or (1, 0))
+    options = ("-f", "logs", "-orga", "me", "--no-render", "--device", "cpu")
+    command("push_to_hub", *of, *options)
+    command("push_to_hub", *of, *options, "--env-kwargs", "first_task:9")
+    assert evaluated == [[0], [9]]
+    card = (hub / "me" / "ppo_cchain-Continual-CartPole-v1" / "README.md").read_text()
+    assert "{'first_task': 9}" in card and "the one that `first_task`" in card
 
 
 def test_an_environment_of_ones_own(hub, tmp_path, monkeypatch):

@@ -26,7 +26,8 @@ def working_clients(gym_packages: Sequence[str] = ()) -> Iterator[None]:
     - ``huggingface_hub`` no longer raises an error of ``requests`` for a file that is not there, such as the statistics of a
       model without normalisation.
 
-    And the model card names the commands of this package, which know its algorithms.
+    And the model card says how this package is installed, names its commands, which know its algorithms, and says what was
+    evaluated and what to cite.
 
     :param gym_packages: Packages that the commands on the card import
     """
@@ -41,6 +42,28 @@ def working_clients(gym_packages: Sequence[str] = ()) -> Iterator[None]:
         yield
 
 
+# What RL Zoo writes on the card, and what is right here
+REPLACEMENTS = (
+    (
+        "Install the RL Zoo (with SB3 and SB3-Contrib):",
+        "Install sb3_cchain, which is not on PyPI yet, in a clone of its repository:",
+    ),
+    ("If you installed the RL Zoo3 via pip (`pip install rl_zoo3`), from anywhere you can do:", "From anywhere you can do:"),
+    ("pip install rl_zoo3", 'pip install ".[zoo]"'),
+    ("python -m rl_zoo3.", "sb3-cchain "),
+)
+
+MORE = """
+## Evaluation
+`mean_reward` is the mean return of 10 episodes in the environment from its beginning. Of a continual environment this is its
+first task, or the one that `first_task` under "Environment Arguments" names; of another world that changes, the world as it
+starts. It says nothing about the other tasks.
+
+## Citation
+Tang et al., [Mitigating Plasticity Loss in Continual Reinforcement Learning by Reducing
+Churn](https://arxiv.org/abs/2506.00592), ICML 2025
+"""
+
 _load, _save_metadata = huggingface_sb3.load_from_hub, huggingface_hub.repocard.metadata_save
 
 
@@ -53,9 +76,9 @@ def _load_from_hub(repo_id: str, filename: str) -> str:
 
 def _save_card(path: Path, metadata: Any, gym_packages: Sequence[str]) -> None:
     card = path.read_text(encoding="utf-8")
-    for stock, name in (("pip install rl_zoo3", 'pip install "sb3-cchain[zoo]"'), ("python -m rl_zoo3.", "sb3-cchain ")):
+    for stock, name in REPLACEMENTS:
         card = card.replace(stock, name)
     if gym_packages:
         card = re.sub("^sb3-cchain .*", rf"\g<0> --gym-packages {' '.join(gym_packages)}", card, flags=re.MULTILINE)
-    path.write_text(card, encoding="utf-8")
+    path.write_text(card + MORE, encoding="utf-8")
     _save_metadata(path, metadata if isinstance(metadata, dict) else metadata.to_dict())
