@@ -9,6 +9,8 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
+from sb3_cchain.networks.dict_observations import DictObservations
+
 
 class Injectable(nn.Module):
     """
@@ -83,7 +85,7 @@ def _check_activation(policy: ActorCriticPolicy | DQNPolicy) -> None:
         raise ValueError(f"`activation_fn` must keep the number of features for {name}, got {activation.__name__}")
 
 
-class InjectionPolicy(ActorCriticPolicy):
+class InjectionPolicy(DictObservations, ActorCriticPolicy):
     """
     SB3's ``MlpPolicy`` for PPO and A2C, for :class:`~sb3_cchain.methods.PlasticityInjection`. Until the injection it computes
     what ``MlpPolicy`` computes, from the same initial parameters. The heads are all behind the features extractor: the hidden
@@ -110,7 +112,7 @@ class InjectionPolicy(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
 
-class InjectionDQNPolicy(DQNPolicy):
+class InjectionDQNPolicy(DictObservations, DQNPolicy):
     """
     SB3's ``MlpPolicy`` for DQN, for :class:`~sb3_cchain.methods.PlasticityInjection`, as :class:`InjectionPolicy`.
 

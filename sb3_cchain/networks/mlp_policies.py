@@ -9,10 +9,11 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
 from sb3_cchain.networks.activations import CReLU, FourierFeatures
+from sb3_cchain.networks.dict_observations import DictObservations
 from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 
 
-class _Hidden:
+class _Hidden(DictObservations):
     """
     What the variants of SB3's policies have in common: linear layers, each followed by a LayerNorm (on request) and the
     activation, which may have several outputs for each unit, as :class:`CReLU` has.
@@ -52,8 +53,8 @@ class LayerNormPolicy(ActorCriticVariant):
     There is none on the observations, on the features (images: give their extractor ``layer_norm=True``) or on the outputs.
 
     All arguments are those of ``ActorCriticPolicy``, with the same defaults; ``net_arch`` is a list or a dict. ``ortho_init``
-    initialises the linear layers as usual; the norms begin as the identity. For ``Dict`` observations give
-    ``features_extractor_class=CombinedExtractor``.
+    initialises the linear layers as usual; the norms begin as the identity. ``Dict`` observations get a
+    ``CombinedExtractor``.
     """
 
     layer_norm = True

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_cchain.networks.dict_observations import DictObservations
 from sb3_cchain.networks.mlp_policies import ActorCriticVariant, DQNVariant
 
 
@@ -110,7 +111,7 @@ class SimBaDQNPolicy(DQNVariant):
         return nn.Sequential(SimBaTrunk(n_inputs, net_arch)), net_arch[-1]
 
 
-class SimBaSACPolicy(SACPolicy):
+class SimBaSACPolicy(DictObservations, SACPolicy):
     """
     SB3's ``MlpPolicy`` for SAC with the network of SimBa, as :class:`SimBaPolicy`, for the actor and each critic.
     ``net_arch`` is a list, or a dict as the default ``dict(pi=[128], qf=[512, 512])``, which is the paper's.
