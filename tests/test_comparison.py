@@ -104,7 +104,8 @@ def test_the_curves_do_not_cross_a_switch():
     for row in back[3:]:
         row["task_id"] = 0
     (axes,) = draw_comparison({"PPO": [back], "other": [run_with([1.0], [1.0], [1.0]), run_with([3.0])]}, window=2).axes
-    curves = [line for line in axes.get_lines() if line.get_linestyle() == "-"]
+    switches = [line for line in axes.get_lines() if line.get_color() == "0.35"]
+    curves = [line for line in axes.get_lines() if line not in switches]
     drawn = [(line.get_xdata()[[0, -1]].tolist(), line.get_ydata()[[0, -1]].tolist()) for line in curves]
     assert drawn == [
         ([100, 200], [0, 1]),
@@ -113,7 +114,19 @@ def test_the_curves_do_not_cross_a_switch():
         ([100, 100], [2, 2]),
     ]
     assert [line.get_label() for line in curves if line.get_label()[0] != "_"] == ["PPO, 1 run", "other, 2 runs"]
-    assert [line.get_xdata()[0] for line in axes.get_lines() if line.get_linestyle() == "--"] == [200, 300]
+    assert [line.get_xdata()[0] for line in switches] == [200, 300]
+
+
+def test_methods_that_lie_on_each_other_can_be_seen():
+    (axes,) = draw_comparison({label: [run_with([1.0] * 4)] for label in "abcd"}, window=1).axes
+    # matplotlib has no public way to ask for the gaps of a line
+    assert len({str(line._unscaled_dash_pattern) for line in axes.get_lines()}) == 4
+
+
+@pytest.mark.parametrize("n_runs, label", [(1, "mean return"), (2, "mean return ± 1 standard error")])
+def test_the_picture_names_its_band(n_runs, label):
+    (axes,) = draw_comparison({"PPO": [run_with([1.0, 2.0])] * n_runs}, window=1).axes
+    assert axes.get_ylabel() == label
 
 
 # The command

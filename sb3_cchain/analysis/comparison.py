@@ -19,6 +19,9 @@ from sb3_cchain.callbacks import task_averages
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Of the methods in turn: those that lie on each other can all be seen
+LINE_STYLES = ("-", (0, (6, 3)), (0, (3, 6)), (0, (1, 3)))
+
 # The returns of a run: rows of `returns.csv`
 Rows = Sequence[Mapping[str, float]]
 # By its label, the runs of each method
@@ -94,8 +97,8 @@ def _interval_text(interval: tuple[float, float] | None) -> str:
 
 def draw_comparison(methods: Methods, window: int) -> "Figure":
     """
-    Draw returns against environment steps: of each method a line for the mean over its runs, and a band of its standard error;
-    dashed lines where the task switches. The :func:`mixed_tasks` are left out.
+    Draw returns against environment steps: of each method a line for the mean over its runs, and a band of ± 1 standard error,
+    without a band for a single run; dashed vertical lines where the task switches. The :func:`mixed_tasks` are left out.
 
     :param methods: By label, the rows of ``returns.csv`` of each run
     :param window: Rows that the running mean goes over, inside a task
@@ -107,20 +110,22 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
         axes = figure.add_subplot()
         curves = {label: [_curves(rows, window, mixed) for rows in runs] for label, runs in methods.items()}
         for number, (label, runs) in enumerate(curves.items()):
+            color, style = f"C{number}", LINE_STYLES[number % len(LINE_STYLES)]
             name: str | None = f"{label}, {len(runs)} run{'s' * (len(runs) > 1)}"
             for curves_in_task in zip(*runs, strict=False):  # as many tasks as all runs have reached
                 grid, mean, low, high = band(curves_in_task)
-                axes.plot(grid, mean, color=f"C{number}", linewidth=1.8, marker="o" * (len(grid) == 1), label=name)
-                axes.fill_between(grid, low, high, color=f"C{number}", alpha=0.2, linewidth=0)
+                axes.plot(grid, mean, color=color, linestyle=style, linewidth=1.8, marker="o" * (len(grid) == 1), label=name)
+                axes.fill_between(grid, low, high, color=color, alpha=0.2, linewidth=0)
                 name = None  # once in the legend
         longest = max((run for runs in curves.values() for run in runs), key=len)
         for steps, _ in longest[:-1]:
             axes.axvline(steps[-1], color="0.35", linestyle="--", linewidth=1)
-        smoothing = f", running mean of {window} rows" if window > 1 else ""
-        axes.set(xlabel="environment steps", ylabel=f"mean return{smoothing}")
+        smoothing = f"\nrunning mean of {window} rows" if window > 1 else ""
+        spread = " ± 1 standard error" if any(len(runs) > 1 for runs in methods.values()) else ""
+        axes.set(xlabel="environment steps", ylabel=f"mean return{spread}{smoothing}")
         axes.xaxis.set_major_formatter(import_matplotlib().ticker.EngFormatter(sep=""))  # 20k, 1M
         axes.spines[["top", "right"]].set_visible(False)
-        figure.legend(loc="outside lower center", ncols=min(len(methods), 4), frameon=False)
+        figure.legend(loc="outside lower center", ncols=min(len(methods), 4), handlelength=3, frameon=False)
     return figure
 
 
