@@ -30,7 +30,7 @@ from benchmarks.report.estimates import (
     reliable_metrics,
     sample,
 )
-from benchmarks.report.figures import plot_learning_curves, plot_quantities
+from benchmarks.report.figures import plot_learning_curves, plot_quantities, plot_reliable_metrics
 from benchmarks.report.first_sight import missing_runs, missing_section
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.page import html_page
@@ -1099,6 +1099,35 @@ def test_best_of_kappa_and_c(tmp_path, no_drawing):
 def test_strengths_of_the_paper():
     assert paper_strengths("procgen", "l2_init") == ["0.1", "1", "10", "100", "1e3"]
     assert paper_strengths("dmc", "cchain") == paper_strengths("gym_control", "trac") == []
+
+
+# The intervals of few seeds
+
+
+@pytest.mark.parametrize(("n_seeds", "is_told"), [(1, False), (2, True), (4, True), (5, False)])
+def test_intervals_of_few_seeds_are_called_too_narrow(tmp_path, no_drawing, n_seeds, is_told):
+    for seed in range(n_seeds):
+        for method in ("vanilla", "cchain"):
+            write(tmp_path, method, [[seed], [seed]], seed=seed)
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    told = "fewer than five seeds, here those of PPO, C-CHAIN PPO, are too narrow"
+    assert (told in text) is is_told and text.count("too narrow") == is_told
+
+
+def test_the_picture_of_the_metrics_names_what_it_shows(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("benchmarks.report.figures.plt.close", drawn.append)
+    estimates = {"vanilla": np.array([0.5, 0.6]), "cchain": np.array([0.7, 0.8])}
+    intervals = {method: np.array([each - 0.1, each + 0.1]) for method, each in estimates.items()}
+    seeds = {"vanilla": [0, 1], "cchain": [0, 1, 2]}
+    plot_reliable_metrics(estimates, intervals, ["mean", "IQM"], GYM_LINES, seeds, tmp_path / "metrics.png")
+    (figure,) = drawn
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["C-CHAIN PPO, 3 seeds", "PPO, 2 seeds"]
+    assert "95 % bootstrap interval" in figure.texts[0].get_text()
+    for panel in figure.axes:
+        left, right = panel.get_xlim()
+        assert all(left < bar.get_x() and bar.get_x() + bar.get_width() < right for bar in panel.patches)
 
 
 # Normalised by the Oracle

@@ -111,30 +111,38 @@ def plot_reliable_metrics(
     intervals: Mapping[str, np.ndarray],
     metric_names: Sequence[str],
     lines: Mapping[str, Method],
+    seeds: Mapping[str, Sequence[int]],
     path: Path,
 ) -> None:
     """
+    Metrics over environments, a panel each: a line for the estimate, a bar for its interval.
+
     :param estimates: Of each method, the metrics
     :param intervals: Of each method, the ends of their intervals
     :param metric_names: Names of the metrics
     :param lines: Label and colour of each method
+    :param seeds: Seeds of each method
     :param path: PNG file
     """
     from rliable.plot_utils import plot_interval_estimates  # only the report needs it
 
     plt.style.use("default")
     height = max(1.6, 0.45 * len(estimates))  # inches
-    upwards = list(estimates)[::-1]
-    figure, _ = plot_interval_estimates(
-        {lines[method].label: estimates[method] for method in upwards},
-        {lines[method].label: intervals[method] for method in upwards},
+    labels = {method: f"{lines[method].label}, {len(seeds[method])} seeds" for method in list(estimates)[::-1]}  # upwards
+    figure, panels = plot_interval_estimates(
+        {label: estimates[method] for method, label in labels.items()},
+        {label: intervals[method] for method, label in labels.items()},
         list(metric_names),
-        colors={lines[method].label: lines[method].color for method in upwards},
+        colors={label: lines[method].color for method, label in labels.items()},
         row_height=height / len(estimates),
         xlabel_y_coordinate=-0.5 / height,
-        xlabel="normalised score",
+        xlabel="normalised score: line, estimate; bar, 95 % bootstrap interval over seeds",
         max_ticks=3,
+        wspace=0.2,
     )
+    for panel in panels:  # bars end before the edge
+        panel.use_sticky_edges = False
+        panel.margins(x=0.08)
     figure.savefig(path, dpi=90, bbox_inches="tight")
     plt.close(figure)
 
