@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch as th
 
+from sb3_cchain.analysis.metrics.rank import singular_values
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -69,6 +71,30 @@ def draw_ntk(axes: Axes, matrix: th.Tensor, title: str) -> AxesImage:
     return axes.imshow(matrix.cpu().numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
 
 
+def draw_singular_values(axes: Axes, matrix: th.Tensor) -> None:
+    """
+    What share of the sum of its singular values the greatest k of them hold. It reaches 99 % at the matrix's srank.
+
+    :param axes: Where to draw; nothing but its text for a matrix that is not finite
+    :param matrix: An NTK
+    """
+    if not matrix.isfinite().all():
+        axes.axis("off")
+        axes.text(0.5, 0.5, "no singular values:\nthe matrix is not finite", ha="center", va="center")
+        return
+    sigma = singular_values(matrix)
+    shares = (sigma.cumsum(dim=0) / sigma.sum().clamp(min=1e-300)).numpy()
+    axes.plot(np.arange(1, len(shares) + 1), shares, marker=".")
+    axes.axhline(0.99, color="0.35", linestyle="--", linewidth=1)
+    axes.text(len(shares), 0.98, "0.99, reached at the srank", ha="right", va="top", color="0.35")
+    axes.set(
+        title="Singular values of the NTK", xlabel="k", ylabel="share of the sum that the k greatest hold", ylim=(0, 1.03)
+    )
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.spines[["top", "right"]].set_visible(False)
+
+
 def plot_models(
     names: Sequence[str],
     ntks: Sequence[tuple[th.Tensor, str]],
@@ -76,7 +102,8 @@ def plot_models(
     bars: Mapping[str, Sequence[Sequence[float]]],
 ) -> Figure:
     """
-    Draw the NTKs of one model or two, where there are any, and bars for each group of their layers.
+    Draw the NTKs of one model or two, where there are any, and bars for each group of their layers. Beside a single NTK its
+    singular values are drawn.
 
     :param names: Names of the models
     :param ntks: For each model that has one, its NTK and the title of that picture
@@ -89,11 +116,11 @@ def plot_models(
     with new_figure(11, sum(heights)) as figure:
         *above, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
         for part in above:
-            for axes, ntk in zip(part.subplots(1, 2).flat, [*ntks, None][:2], strict=True):
-                if ntk is None:
-                    axes.axis("off")
-                else:
-                    part.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
+            panels = part.subplots(1, 2)
+            for axes, ntk in zip(panels, ntks, strict=False):
+                part.colorbar(draw_ntk(axes, *ntk), ax=axes, extend="both", label="inner product of gradients")
+            if len(ntks) == 1:
+                draw_singular_values(panels[1], ntks[0][0])
         height = 0.8 / len(names)
         all_axes = below.subplots(1, len(bars), sharey=True, squeeze=False)[0]
         for axes, (title, values) in zip(all_axes, bars.items(), strict=True):

@@ -129,7 +129,9 @@ def _picture(inspections: Sequence[Inspection]) -> str:
     file = io.BytesIO()
     draw(inspections).savefig(file, format="png")
     data = base64.b64encode(file.getvalue()).decode()
-    kernels = "The neural tangent kernel as a matrix, and bars" if any(i.ntk is not None for i in inspections) else "Bars"
+    n_ntks = sum(inspection.ntk is not None for inspection in inspections)
+    alone = " and its singular values" if n_ntks == 1 else ""
+    kernels = f"The neural tangent kernel as a matrix{alone}, and bars" if n_ntks else "Bars"
     what = f"{kernels} of the units, the features and the weights of each group of layers."
     names = " and ".join(inspection.name for inspection in inspections)
     image = f'<img alt="{escape(f"{names}: {what}")}" src="data:image/png;base64,{data}">'
