@@ -30,6 +30,7 @@ from sb3_cchain.networks.batch_outputs import (
     recurrent_actions,
     recurrent_values,
 )
+from sb3_cchain.networks.policy_outputs import has_own_distribution
 from sb3_cchain.validation import check_choice
 
 # The names in `churn_target`
@@ -40,8 +41,13 @@ def policy_divergence(policy: Any) -> Divergence:
     """
     :param policy: An actor-critic policy
     :return: Cross-entropy where actions are discrete, mean squared difference of the action means where they are Gaussian
-    :raises TypeError: For an action distribution that is neither
+    :raises TypeError: For an action distribution that is neither, or where there is none to ask for
     """
+    if not hasattr(policy, "mlp_extractor") and not has_own_distribution(policy):
+        raise TypeError(
+            f"Churn reduction needs the action distribution of {type(policy).__name__}, which has no networks of SB3's: "
+            'define `get_distribution(observations)`, or hold the values still (churn_target="value").'
+        )
     distribution = policy.action_dist
     # Those of sb3-contrib's MaskablePPO have no common base with them
     if isinstance(distribution, (CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)) or (
@@ -307,7 +313,9 @@ class ChurnArguments:
         _say_when_there_is_no_other_data(model)
         for name in self.target_names(kind, type(model).__name__):
             target = kind.targets[name]
-            divergence = target.divergence(model.policy)
+            # Without churn reduction any policy will do
+            is_off = self.make_coefficient(name, kind, 1.0).is_zero
+            divergence = mean_squared_difference if is_off else target.divergence(model.policy)
             # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
             outputs = partial(_outputs, model, target)
             reducers[name] = ChurnReducer(

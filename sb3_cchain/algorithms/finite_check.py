@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn.parameter import is_lazy
 
 from sb3_cchain.networks.compiled import uncompiled
 
@@ -18,8 +19,8 @@ FEW_VALUES = 100
 class FiniteCheck(BaseCallback):
     """
     Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked. Of
-    an on-policy algorithm it checks the parameters of the policy before each rollout and at the end of training, and what the
-    policy gave after each rollout.
+    an on-policy algorithm it checks the parameters of the policy that are trained, before each rollout and at the end of
+    training, and what the policy gave after each rollout.
 
     Torch would raise an error, too, but later, and one that names neither the environment nor the step nor the parameter.
     """
@@ -55,7 +56,8 @@ class FiniteCheck(BaseCallback):
 
     def _check_parameters(self) -> None:
         for name, parameter in uncompiled(self.model.policy).named_parameters():
-            if not parameter.isfinite().all():
+            # Parameters that are not trained may be infinite on purpose, as a mask
+            if parameter.requires_grad and not is_lazy(parameter) and not parameter.isfinite().all():
                 raise ValueError(
                     f"The policy's parameter {name} holds NaN or infinite values at step {self.num_timesteps} of training. "
                     "Lower the learning rate, set `max_grad_norm`, or scale the rewards."

@@ -19,13 +19,14 @@ def with_continual_callbacks(given: list[BaseCallback], env: VecEnv | None) -> l
     :return: The same, in a continual environment preceded by TaskSync and ContinualMetrics. With a TaskSignal among them,
         ContinualMetrics is right behind it, in any environment. What is already there is not added.
     """
-    given = list(_unpacked(given))
 
     def has(kind: type[BaseCallback], callbacks: list[BaseCallback]) -> bool:
         return any(isinstance(callback, kind) for callback in iterate_callbacks(CallbackList(callbacks)))
 
     sync = [TaskSync()] if is_continual(env) and not has(TaskSync, given) else []
     has_signal = has(TaskSignal, given)
+    if has_signal:  # which may be inside a CallbackList
+        given = list(_unpacked(given))
     metrics = [ContinualMetrics()] if (is_continual(env) or has_signal) and not has(ContinualMetrics, given) else []
     # Callbacks behind it may change what a step has told, as NoBootstrapAtCuts does
     n_before = next((n for n in range(len(given) + 1) if has(TaskSignal, given[:n])), 0)

@@ -139,7 +139,7 @@ def is_plain(policy: nn.Module) -> bool:
         and isinstance(policy.observation_space, spaces.Box)
         and not is_image_space(policy.observation_space)
         and type(policy.features_extractor) is FlattenExtractor
-        and type(policy.mlp_extractor) is MlpExtractor
+        and type(getattr(policy, "mlp_extractor", None)) is MlpExtractor
         and type(policy.mlp_extractor.policy_net) is type(policy.mlp_extractor.value_net) is nn.Sequential
         and not is_instrumented(policy)
         and not nn.modules.module._has_any_global_hook()  # as those that count operations

@@ -9,10 +9,12 @@ def is_continual(env: VecEnv | None) -> bool:
     :param env: A vectorised environment
     :return: Whether it consists of :class:`~sb3_cchain.ContinualEnv`
     """
-    if env is None or not (env.has_attr("task_sequence") and env.has_attr("set_clock")):
+    if env is None:
         return False
-    # Vectorised environments that have no attributes to give may give None for all of them
-    return env.get_attr("task_sequence", indices=0)[0] is not None
+    try:
+        return env.has_attr("set_clock") and env.get_attr("task_sequence", indices=0)[0] is not None
+    except Exception:  # vectorised environments that have no attributes to give may raise any error
+        return False
 
 
 def require_continual(callback: BaseCallback) -> None:

@@ -39,5 +39,6 @@ def add_overview(model: BaseAlgorithm) -> None:
         return
     for output in outputs:
         if isinstance(output, TensorBoardOutputFormat):
-            outputs += [TensorBoardLayout(output.writer), TensorBoardHyperparameters(output.writer, hyperparameters(model))]
+            new = [TensorBoardLayout(output.writer), TensorBoardHyperparameters(output.writer, hyperparameters(model))]
+            model.logger.output_formats = [*outputs, *new]  # the user's own list stays as it is
             return
