@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sb3_cchain.analysis.comparison import comparison_table, draw_comparison
+from sb3_cchain.analysis.comparison import comparison_table, draw_comparison, mixed_tasks
 from sb3_cchain.analysis.curves import band, smoothed
 from sb3_cchain.analysis.metrics.intervals import difference_interval, mean_interval
 from tests.zoo_command import FAST, NO_EVALUATION, SHORT_PPO, command
@@ -171,23 +171,26 @@ def test_a_shorter_run_is_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "tasks, ends",
+    "tasks, steps, begin",
     [
-        (([1.0] * 12, [2.0] * 8), "1,200, 2,000"),
-        (([1.0] * 20,), "2,000"),
-        (([1.0] * 10, [2.0] * 5, [3.0] * 5), "1,000, 1,500, 2,000"),
-        (([1.0] * 11, [2.0] * 9), None),  # a rollout later
-        (([1.0] * 10, [2.0] * 5), None),  # shorter
-        (([1.0] * 9,), None),
+        (([1.0] * 12, [2.0] * 8), 100, "0, 1,300"),
+        (([1.0] * 20,), 100, "0"),
+        (([1.0] * 10, [2.0] * 5, [3.0] * 5), 100, "0, 1,100, 1,600"),
+        # A longer rollout, in which the same switch is
+        (([1.0] * 2, [2.0] * 2), 512, None),
+        (([1.0] * 3, [2.0] * 1), 512, "0, 2,048"),
+        # Shorter
+        (([1.0] * 10, [2.0] * 5), 100, None),
+        (([1.0] * 9,), 100, None),
     ],
 )
-def test_tasks_that_end_elsewhere_are_named(tasks, ends, tmp_path, capsys):
+def test_tasks_that_begin_elsewhere_are_named(tasks, steps, begin, tmp_path, capsys):
     first = write(tmp_path / "a.csv", run_with([1.0] * 10, [2.0] * 10)).resolve()
-    other = write(tmp_path / "b.csv", run_with(*tasks)).resolve()
+    other = write(tmp_path / "b.csv", run_with(*tasks, steps=steps)).resolve()
     command("compare", "-r", "a", first, "-r", "b", other)
-    line = f"Other tasks: those of {other} end at step {ends}, those of {first} at 1,000, 2,000. Tasks of the same"
+    line = f"Other tasks: those of {other} begin at step {begin}, those of {first} at 0, 1,100. Tasks of the same"
     output = capsys.readouterr().out
-    assert (line in output) if ends else ("Other tasks" not in output)
+    assert (line in output) if begin else ("Other tasks" not in output)
 
 
 def endless(*tasks):
@@ -204,6 +207,11 @@ def test_rewards_per_step_are_not_compared_with_returns(tmp_path, capsys):
     assert re.search(r"\| J\(T\) +\| +-40 \| +-50 \|", output) and not re.search(r"\n\| 1 ", output)
     lines = draw_comparison({"a": [run_with([-40.0], [-30.0])], "b": [collapsed]}, window=1).axes[0].get_lines()
     assert [value for line in lines for value in line.get_ydata() if len(line.get_ydata()) == 1] == [-40, -50]
+
+
+def test_a_task_that_comes_back_is_cut_in_its_last_visit():
+    rows = [*run_with([-50.0], [-40.0]), {"timesteps": 300, "task_id": 0, "n_episodes": 0, "mean_return": -1.0}]
+    assert mixed_tasks({"a": [rows], "b": [run_with([-50.0], [-40.0])]}) == []
 
 
 def test_rewards_per_step_are_compared_with_each_other():

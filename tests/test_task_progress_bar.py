@@ -123,12 +123,13 @@ def test_chunks_and_first_task(bar):
         ([TaskSignal(switch_every=20)], "task 2, next in 12 steps (0:00:00), return 7"),
         ([TaskSignal(switch_at=[20, 60])], "task 1, next in 12 steps (0:00:00), return 7"),
         ([TaskSignal(switch_at=[20])], "task 1, return 7"),
+        ([TaskSignal(switch_every=32)], "task 1, return 7"),  # another would begin at the end
     ],
-    ids=["no tasks", "unknown", "every", "at", "the last"],
+    ids=["no tasks", "unknown", "every", "at", "the last", "the last of many"],
 )
 def test_an_environment_without_tasks(bar, callbacks, words):
     model, look = make(make_vec_env(CountEnv)), Look(bar, 48)
-    model.learn(48, callback=[*callbacks, bar, look])
+    model.learn(64, callback=[*callbacks, bar, look])
     assert look.seen[48][0] == words
     assert callbacks or not hasattr(model, "task_count")  # which would be saved with the model
 

@@ -384,11 +384,11 @@ def test_methods_act_before_the_first_step_of_the_new_world(source):
     assert heard == [SWITCH]
 
 
-@pytest.mark.parametrize("step, expected", [(0, 32), (16, 32), (32, 64)])
+@pytest.mark.parametrize("step, expected", [(0, 32), (16, 32), (32, 64), (64, None)])
 @pytest.mark.parametrize("arguments", [dict(switch_every=32), dict(switch_at=[32, 64])], ids=["every", "at"])
 def test_the_next_switch(arguments, step, expected):
     signal = TaskSignal(**arguments)
-    signal.num_timesteps = step
+    signal.model, signal.num_timesteps = SimpleNamespace(_total_timesteps=96), step
     assert signal.next_switch == expected
 
 

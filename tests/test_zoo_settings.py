@@ -9,6 +9,8 @@ import torch as th
 import yaml
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from benchmarks.grid.run import suite_methods
 from sb3_cchain import CChainDQN, CChainPPO, DoubleDQN
@@ -350,6 +352,9 @@ def test_what_settings_lack_of_a_method_is_found(algo, parts):
     there = {"policy": method.policy, "policy_kwargs": {"optimizer_class": method.optimizer_class}}
     callbacks = [callback() for callback in method.callbacks]
     assert missing_parts(method, there, callbacks) == []
+    assert missing_parts(method, there, [EveryNTimesteps(10, CallbackList(callbacks))]) == []
+    stock = [part for part in parts if part.endswith("Policy")]
+    assert missing_parts(method, {**there, "policy": ActorCriticPolicy}, callbacks) == stock
     # An optimiser inside of others
     inside = {"optimizer_class": UPGD, "optimizer_kwargs": {"base_class": method.optimizer_class, "base_kwargs": None}}
     assert missing_parts(method, {**there, "policy_kwargs": inside}, callbacks) == []
@@ -361,6 +366,8 @@ def test_a_file_of_the_user_without_the_method_is_refused(tmp_path):
     with pytest.raises(SystemExit, match=r"ppo_trac: the settings of CartPole-v1 in .*mine\.yml lack TRAC, .*ppo_trac\.yml"):
         train(logs, "ppo_trac", "CartPole-v1", 64, "-conf", file)
     assert not logs.exists()
+    with pytest.raises(SystemExit, match=r"lack TRAC, .* -params replaces the whole of policy_kwargs\. .*ppo_trac\.yml"):
+        train(logs, "ppo_trac", "Continual/CartPole-v1", 64, "-params", "policy_kwargs:dict(net_arch=[8])")
     train(logs, "ppo_cchain", "CartPole-v1", 64, "-conf", file)
 
 

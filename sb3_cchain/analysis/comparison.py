@@ -34,12 +34,13 @@ def mixed_tasks(methods: Methods) -> list[int]:
     :return: The tasks in which no episode ended in some of the runs, but in others. The return of the former is a reward per
         step, which is not to be compared with returns of episodes
     """
-    with_episodes: dict[int, set[bool]] = defaultdict(set)
+    # By task: whether an episode ended in it, of each run
+    has_episodes: dict[int, list[bool]] = defaultdict(list)
     for runs in methods.values():
         for rows in runs:
-            for row in rows:
-                with_episodes[int(row["task_id"])].add(row["n_episodes"] > 0)
-    return sorted(task for task, kinds in with_episodes.items() if len(kinds) > 1)
+            for task in dict.fromkeys(int(row["task_id"]) for row in rows):
+                has_episodes[task].append(any(row["n_episodes"] > 0 for row in rows if row["task_id"] == task))
+    return sorted(task for task, each in has_episodes.items() if any(each) and not all(each))
 
 
 def common_tasks(methods: Methods) -> list[int]:

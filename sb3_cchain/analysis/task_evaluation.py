@@ -40,6 +40,7 @@ NEEDLESS = (
     wrappers.NormalizeReward,
     wrappers.RecordEpisodeStatistics,
     wrappers.RecordVideo,
+    wrappers.RenderCollection,
     Monitor,
     ResumableEnv,
     TaskCaption,
@@ -230,7 +231,8 @@ def _make_eval_env(model: BaseAlgorithm) -> VecEnv:
     if lost:
         raise ValueError(
             f"The training environment is wrapped in {', '.join(lost)}, which may change what the agent sees or does. Give "
-            "the callback an `eval_env` with the same wrappers, or wrap each task inside the continual environment"
+            "the callback an `eval_env` with the same wrappers, or wrap each task inside the continual environment. A wrapper "
+            "of rewards alone may be derived from gymnasium.RewardWrapper"
         )
     env = model._wrap_env(gym.make(replace(spec, additional_wrappers=())), verbose=0)
     normalize = model.get_vec_normalize_env()

@@ -119,10 +119,12 @@ class TaskSignal(BaseCallback):
 
     @property
     def next_switch(self) -> int | None:
-        """Environment steps after which the next task begins; None where that is not known before."""
+        """Environment steps after which the next task of this ``learn()`` begins; None where none does, or it is not known."""
         if self.switch_every is not None:
-            return (self.num_timesteps // self.switch_every + 1) * self.switch_every
-        return next((step for step in self.switch_at or () if step > self.num_timesteps), None)
+            step: int | None = (self.num_timesteps // self.switch_every + 1) * self.switch_every
+        else:
+            step = next((step for step in self.switch_at or () if step > self.num_timesteps), None)
+        return step if step is not None and step < self.model._total_timesteps else None
 
     def _on_training_start(self) -> None:
         require_single(self)

@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import pairwise
 from pathlib import Path
 
 from rich.console import Console
@@ -144,27 +144,36 @@ def print_switches(methods: dict[str, dict[Path, Rows]], console: Console) -> No
     :param methods: The rows of each run, by label and file
     :param console: Where
     """
-    runs = {file: rows for of_method in methods.values() for file, rows in of_method.items()}
-    ends = {file: _ends_of_tasks(rows) for file, rows in runs.items()}
-    tolerance = (1 - SHORT) * max(steps[-1] for steps in ends.values())
-    first, *others = ends
-    for file in others:
-        a, b = ends[first], ends[file]
-        both_run_until = min(a[-1], b[-1]) - tolerance
-        n = min(len(a), len(b)) - 1
-        only_in_one = [end for end in (*a[n:-1], *b[n:-1]) if end < both_run_until]
-        if only_in_one or any(abs(x - y) > tolerance for x, y in zip(a[:n], b[:n], strict=True)):
+    (first, rows), *others = [pair for runs in methods.values() for pair in runs.items()]
+    for file, other_rows in others:
+        a, b = _switches(rows), _switches(other_rows)
+        n = min(len(a), len(b))
+        differ = any(
+            before >= other_end or other_before >= end
+            for (before, end), (other_before, other_end) in zip(a[:n], b[:n], strict=True)
+        )
+        # Beyond the end of the shorter run there is nothing to compare with
+        both_run_until = min(rows[-1]["timesteps"], other_rows[-1]["timesteps"])
+        if differ or any(end <= both_run_until for _, end in (*a[n:], *b[n:])):
             print_line(
                 console,
-                f"Other tasks: those of {file} end at step {_listed(b)}, those of {first} at {_listed(a)}. Tasks of the same "
-                "number are not of the same steps",
+                f"Other tasks: those of {file} begin at step {_listed(b)}, those of {first} at {_listed(a)}. Tasks of the "
+                "same number are not of the same steps",
             )
 
 
-def _listed(steps: Sequence[int]) -> str:
-    return ", ".join(f"{step:,}" for step in steps)
+def _switches(rows: Rows) -> list[tuple[int, int]]:
+    """
+    :param rows: The rows of a run
+    :return: For each switch, a step before it and the step of the first row after it, between which it was
+    """
+    switches = []
+    for row, next_row in pairwise(rows):
+        if next_row["task_id"] != row["task_id"]:
+            end = int(next_row["timesteps"])
+            switches.append((max((int(each["timesteps"]) for each in rows if each["timesteps"] < end), default=0), end))
+    return switches
 
 
-def _ends_of_tasks(rows: Rows) -> list[int]:
-    """Environment steps of the last row of each task, in the order of training."""
-    return [int(list(of_task)[-1]["timesteps"]) for _, of_task in groupby(rows, key=lambda row: row["task_id"])]
+def _listed(switches: Sequence[tuple[int, int]]) -> str:
+    return ", ".join(["0", *(f"{end:,}" for _, end in switches)])

@@ -104,9 +104,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         hyperparams, _, callbacks, _ = processed
         method = BY_ALGO.get(self.algo)
         if method is not None and (missing := missing_parts(method, hyperparams, callbacks)):
+            replaced_parts = {"policy", "policy_kwargs", "callback"} & set(self.custom_hyperparams or ())
+            by = f"-params replaces the whole of {' and '.join(sorted(replaced_parts))}. " if replaced_parts else ""
             sys.exit(
-                f"{self.algo}: the settings of {self.env_name} in {self.config} lack {' and '.join(missing)}, without which "
-                f"they are not those of the method. {settings_path(self.algo)} shows how to name it"
+                f"{self.algo}: the settings of {self.env_name.gym_id} in {self.config} lack {' and '.join(missing)}, without "
+                f"which they are not those of the method. {by}{settings_path(self.algo)} shows how to name it"
             )
         return processed
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_cchain.methods import OptimizerMetrics
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
+from sb3_cchain.tasks.callback_tree import iterate_callbacks
 
 
 def hyperparams_folder() -> Path:
@@ -114,9 +115,10 @@ def missing_parts(method: Method, hyperparams: Mapping[str, Any], callbacks: Seq
     parts: list[type] = [callback for callback in method.callbacks if callback is not OptimizerMetrics]
     if method.optimizer_class is not None:
         parts.append(method.optimizer_class)
-    there = [*map(type, callbacks), *_optimizer_classes(policy_kwargs)]
+    there = [*map(type, iterate_callbacks(CallbackList(list(callbacks)))), *_optimizer_classes(policy_kwargs)]
     missing = [part.__name__ for part in parts if not any(issubclass(each, part) for each in there)]
-    if isinstance(method.policy, type) and isinstance(policy, str) and "features_extractor_class" not in policy_kwargs:
+    is_stock = not isinstance(policy, type) or policy.__module__.startswith("stable_baselines3.")
+    if isinstance(method.policy, type) and is_stock and "features_extractor_class" not in policy_kwargs:
         missing.append(method.policy.__name__)
     return missing
 
@@ -124,8 +126,8 @@ def missing_parts(method: Method, hyperparams: Mapping[str, Any], callbacks: Seq
 def _optimizer_classes(policy_kwargs: Mapping[str, Any]) -> Iterator[type]:
     """The optimiser of a policy, and those inside of it."""
     name, kwargs = "optimizer", policy_kwargs
-    while isinstance(optimizer_class := kwargs.get(f"{name}_class"), type):
-        yield optimizer_class
+    while (optimizer_class := kwargs.get(f"{name}_class")) is not None:
+        yield getattr(optimizer_class, "func", optimizer_class)  # which a partial() is of
         name, kwargs = "base", kwargs.get(f"{name}_kwargs") or {}
 
 
