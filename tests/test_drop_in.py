@@ -83,6 +83,19 @@ def test_vectorised_environments_without_attributes(algorithm, kwargs, given):
     assert algorithm("MlpPolicy", env, **kwargs).learn(16).num_timesteps == 16
 
 
+class NaNReward(RandomEnv):
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, float("nan"), terminated, truncated, info
+
+
+def test_what_is_wrong_is_said_without_attributes():
+    env = Closed([NaNReward])
+    env.given = NotImplementedError()
+    with pytest.raises(ValueError, match="Environment 0 gave a NaN or infinite reward at step 1 of training"):
+        CChainPPO("MlpPolicy", env, **ALGORITHMS[0][1]).learn(16)
+
+
 class LazyExtractor(BaseFeaturesExtractor):
     """Has parameters without a shape before its first forward pass, and some that are infinite on purpose."""
 

@@ -101,6 +101,7 @@ def _surely_finite(values: NDArray[Any]) -> bool:
 
 
 def _id(env: VecEnv, index: int) -> str:
-    # Environments that are not Gymnasium's may have no such attribute
-    spec = env.get_attr("spec", index)[0] if env.has_attr("spec") else None
-    return f" ({spec.id})" if spec is not None else ""
+    try:
+        return f" ({env.get_attr('spec', index)[0].id})"
+    except Exception:  # as of environments that are not Gymnasium's; what is wrong must be said in any case
+        return ""
