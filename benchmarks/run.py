@@ -58,8 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument(
         "--seeds",
+        nargs="+",
         type=int,
-        help=f"Number of seeds; by default the paper's ({paper_seeds}); of the other budgets {fewer_seeds}",
+        help=f"Seeds, by default from 0 on as many as in the paper ({paper_seeds}); of the other budgets {fewer_seeds}",
     )
     parser.add_argument("--budget", choices=BUDGETS, help="Length of the runs, by default the paper's; reduced for the shelf")
     parser.add_argument("--dry-run", action="store_true", help="List the runs and what they will cost, and train nothing")

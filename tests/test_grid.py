@@ -156,7 +156,8 @@ def test_a_variant_has_a_folder_of_its_own(tmp_path):
 
 
 def test_the_committed_results_count(capsys):
-    arguments = ["--suite", "gym_control", "--budget", "reduced", "--method", "cchain", "vanilla", "oracle", "--seeds", "2"]
+    arguments = ["--suite", "gym_control", "--budget", "reduced", "--method", "cchain", "vanilla", "oracle"]
+    arguments += ["--seeds", "0", "1"]
     assert main([*arguments, "--dry-run", "--results", str(ROOT / "benchmarks" / "results")]) == 0
     assert "24 runs, 24 of them done." in capsys.readouterr().out
 
@@ -197,7 +198,7 @@ def test_the_grid_of_gym_control():
     # A suite in 6 hours on two cores
     assert sum(map(Rates([]).seconds, grid)) < 2 * 6 * 3600
     grid = grid_runs(
-        ["gym_control"], ["Continual/MountainCar-v0", "Continual/CartPole-v1"], ["cchain", "vanilla", "cchain"], 2
+        ["gym_control"], ["Continual/MountainCar-v0", "Continual/CartPole-v1"], ["cchain", "vanilla", "cchain"], [1, 0, 1]
     )
     assert [(run.seed, run.method, run.env_id, run.n_tasks, run.steps_per_task) for run in grid] == [
         (seed, method, *env)
@@ -210,7 +211,7 @@ def test_the_grid_of_gym_control():
 
 def test_another_strength_is_a_line_of_its_own(tmp_path):
     cartpole = ["Continual/CartPole-v1"]
-    grid = grid_runs(["gym_control"], cartpole, ["cchain@1000", "vanilla", "cchain@0.05", "cchain@1e3", "cchain"], 2)
+    grid = grid_runs(["gym_control"], cartpole, ["cchain@1000", "vanilla", "cchain@0.05", "cchain@1e3", "cchain"], [0, 1])
     assert [(run.seed, run.line, run.method) for run in grid] == [
         (seed, *line)
         for seed in (0, 1)
@@ -230,7 +231,7 @@ def test_another_strength_is_a_line_of_its_own(tmp_path):
     assert make_run("gym_control", *cartpole, "cchain@10000", 0, 10, 16_000, "reduced") == make_run(
         "gym_control", *cartpole, "cchain", 0, 10, 16_000, "reduced"
     )
-    assert [run.line for run in grid_runs(["gym_control"], cartpole, ["cchain@1e4", "vanilla", "cchain"], 1)] == [
+    assert [run.line for run in grid_runs(["gym_control"], cartpole, ["cchain@1e4", "vanilla", "cchain"], [0])] == [
         *("cchain", "vanilla")
     ]
     evaluated = make_run("minatar", "Continual/MinAtar-v0", "cchain@0.1", 0, 3, 3000, "smoke")
@@ -403,7 +404,7 @@ def test_runs_that_cannot_be_are_refused(changes, message):
             ["--method", "trac@1"],
             r"a strength after @ for weight_clipping \(κ\), l2_init \(c\), cchain \(β\) only; got trac@1",
         ),
-        (["--seeds", "0"], "--seeds must be at least 1; got 0"),
+        (["--seeds", "0", "-1"], "`seeds` must be an integer greater than or equal to 0, got -1"),
         (["--gpus-per-run", "-1"], "--gpus-per-run: must be from 0.0001 to 1, or a whole number; got -1"),
         (["--gpus-per-run", "1.5"], "--gpus-per-run: must be .*; got 1.5"),
         (["--gpus-per-run", "1e-5"], "--gpus-per-run: must be .*; got 1e-5"),

@@ -7,6 +7,7 @@ from benchmarks.grid.run import Run, available_methods, make_run, paper_methods,
 from benchmarks.grid.strengths import split_line
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
+from sb3_cchain.validation import check_number
 
 BUDGETS = ("paper", "reduced", "smoke")
 # Seeds of a budget; the paper's own stand in the suite's row
@@ -18,7 +19,7 @@ APART = ("smoke", "plasticity")
 # Where all methods of the registry are compared with each other, those of the paper and the others
 SHELF_SUITES = ("gym_control", "dmc")
 SHELF_ENVS = ("Continual/Acrobot-v1", "Continual/LunarLander-v3", "Continual/Walker-v0")
-SHELF_SEEDS = 2
+SHELF_SEEDS = (0, 1)
 
 
 def run_length(suite: str, env_id: str, budget: str) -> tuple[int, int]:
@@ -47,7 +48,7 @@ def grid_runs(
     suites: Sequence[str],
     env_ids: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
-    n_seeds: int | None = None,
+    seeds: Iterable[int] | None = None,
     budget: str = "paper",
 ) -> list[Run]:
     """
@@ -58,19 +59,19 @@ def grid_runs(
     :param methods: Methods, in the order in which they are to run, by default all that the paper compares in the suite. A
         method runs in those of the environments for which it has hyperparameters. ``cchain@1e3`` is C-CHAIN with β 1e3,
         ``weight_clipping@0.5`` weight clipping with κ 0.5, ``l2_init@10`` L2 Init with c 10
-    :param n_seeds: Number of seeds, from 0; by default that of the budget
+    :param seeds: Seeds, by default as many as the budget has, from 0 on
     :param budget: One of ``BUDGETS``
     :return: The runs, in the order in which they are to run
-    :raises ValueError: For an environment or a method that none of the suites has, a strength that cannot be, less than one
-        seed, or when nothing is left
+    :raises ValueError: For an environment or a method that none of the suites has, a strength that cannot be, a seed less
+        than 0, or when nothing is left
     """
     all_envs = [(suite, env_id) for suite in suites for env_id in SUITES[suite].env_ids]
     available = {name for suite, env_id in all_envs for name in available_methods(suite, env_id)}
     _check_names("env", env_ids, [env_id for _, env_id in all_envs], suites)
     lines = _same_once(methods)
     _check_names("method", [method for method, _ in lines], [name for name in METHOD_NAMES if name in available], suites)
-    if n_seeds is not None and n_seeds < 1:
-        raise ValueError(f"--seeds must be at least 1; got {n_seeds}")
+    for seed in seeds or ():
+        check_number("seeds", seed, 0, integer=True)
     grid: dict[Run, tuple[int, int]] = {}
     for suite, env_id in all_envs:
         if env_ids is not None and env_id not in env_ids:
@@ -80,7 +81,7 @@ def grid_runs(
         n_tasks, steps = run_length(suite, env_id, budget)
         # At other budgets as in the paper
         eval_freq = steps if budget == "smoke" else None
-        for seed in range(n_seeds or N_SEEDS.get(budget, SUITES[suite].n_paper_seeds)):
+        for seed in seeds or range(N_SEEDS.get(budget, SUITES[suite].n_paper_seeds)):
             for rank, (method, strength) in enumerate(chosen):
                 line = method if strength is None else f"{method}@{strength}"
                 run = make_run(suite, env_id, line, seed, n_tasks, steps, budget, eval_freq)
@@ -96,7 +97,7 @@ def grid_runs(
 def shelf_runs(
     env_ids: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
-    n_seeds: int | None = None,
+    seeds: Iterable[int] | None = None,
     budget: str = "reduced",
 ) -> list[Run]:
     """
@@ -104,13 +105,13 @@ def shelf_runs(
 
     :param env_ids: Environments, by default ``SHELF_ENVS``
     :param methods: Methods, by default all that have hyperparameters there
-    :param n_seeds: Number of seeds, by default ``SHELF_SEEDS``
+    :param seeds: Seeds, by default ``SHELF_SEEDS``
     :param budget: One of ``BUDGETS``
     :return: As :func:`grid_runs`
     :raises ValueError: As :func:`grid_runs`
     """
     methods = methods or list(suite_methods(SHELF_SUITES[0]))
-    return grid_runs(SHELF_SUITES, env_ids or SHELF_ENVS, methods, SHELF_SEEDS if n_seeds is None else n_seeds, budget)
+    return grid_runs(SHELF_SUITES, env_ids or SHELF_ENVS, methods, seeds or SHELF_SEEDS, budget)
 
 
 def _same_once(lines: Iterable[str] | None) -> list[tuple[str, str | None]]:

@@ -333,8 +333,8 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
     counted = [f"- {n} runs at {escaped(name)}" for name, n in commits.items()]
     budget = shlex.quote(" ".join(experiment.split()))
     commands = []
-    for (suite, n_seeds, methods), env_ids in _same_runs(results).items():
-        options = f"--env {' '.join(env_ids)} --method {' '.join(methods)} --seeds {n_seeds}"
+    for (suite, seeds, methods), env_ids in _same_runs(results).items():
+        options = f"--env {' '.join(env_ids)} --method {' '.join(methods)} --seeds {' '.join(map(str, seeds))}"
         commands.append(f"python -m benchmarks.run --suite {suite} --budget {budget} {options}")
     commands.append(f"python -m benchmarks.report --budget {budget}")
     parts = [
@@ -350,16 +350,15 @@ def _runs_section(results: Sequence[Result], experiment: str, left_out: Sequence
     return "\n\n".join(parts)
 
 
-def _same_runs(results: Sequence[Result]) -> dict[tuple[str, int, tuple[str, ...]], list[str]]:
-    """By suite, number of seeds and methods, the environments that have just these methods with this number of seeds."""
-    n_seeds: dict[tuple[str, str, str], int] = {}
+def _same_runs(results: Sequence[Result]) -> dict[tuple[str, tuple[int, ...], tuple[str, ...]], list[str]]:
+    """By suite, seeds and methods, the environments that have just these methods with these seeds."""
+    seeds: dict[tuple[str, str, str], list[int]] = {}
     for run in results:
-        key = run.suite, run.env_id, run.line
-        n_seeds[key] = max(n_seeds.get(key, 0), run.seed + 1)
-    lines: dict[tuple[str, str, int], list[str]] = {}
-    for (suite, env_id, line), n in n_seeds.items():
-        lines.setdefault((suite, env_id, n), []).append(line)
-    env_ids: dict[tuple[str, int, tuple[str, ...]], list[str]] = {}
-    for (suite, env_id, n), there in lines.items():
-        env_ids.setdefault((suite, n, tuple(lines_in_order(there))), []).append(env_id)
+        seeds.setdefault((run.suite, run.env_id, run.line), []).append(run.seed)
+    by_seeds: dict[tuple[str, str, tuple[int, ...]], list[str]] = {}
+    for (suite, env_id, line), with_line in seeds.items():
+        by_seeds.setdefault((suite, env_id, tuple(sorted(with_line))), []).append(line)
+    env_ids: dict[tuple[str, tuple[int, ...], tuple[str, ...]], list[str]] = {}
+    for (suite, env_id, same), lines in by_seeds.items():
+        env_ids.setdefault((suite, same, tuple(lines_in_order(lines))), []).append(env_id)
     return env_ids

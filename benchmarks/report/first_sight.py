@@ -146,7 +146,7 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
             for method in paper.methods
         ]
         hours = ENOUGH_SEEDS * sum(map(rates.seconds, whole)) / 3600
-        command = f"python -m benchmarks.run --suite {suite} --budget paper --seeds {ENOUGH_SEEDS}"
+        command = f"python -m benchmarks.run --suite {suite} --budget paper --seeds {' '.join(map(str, range(ENOUGH_SEEDS)))}"
         lines.append(f"{command}    # for verdicts: {hours:,.0f} core-hours in all")
     return [*parts, "```bash\n" + "\n".join(lines) + "\n```"]
 
