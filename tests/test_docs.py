@@ -1,8 +1,8 @@
 """
 What README and documentation show works as it stands there.
 
-Two things are shortened. Every number from 10 000 on, such as the length of a training, becomes 256; and a rollout has 128
-steps. Python snippets of a page run in order and share their names; a test among them is run as well.
+Three things are shortened. Every number from 10 000 on, such as the length of a training, becomes 256; a search has two
+trials; and a rollout has 128 steps. Python snippets of a page run in order and share their names; a test among them is run as well.
 """
 
 import argparse
@@ -65,11 +65,12 @@ def pages_with(language: str) -> list[Path]:
 
 
 def shorten(code: str) -> str:
-    return re.sub(r"\b\d[\d_]{4,}\b", "256", code)
+    return re.sub(r"\bn_trials=\d+", "n_trials=2", re.sub(r"\b\d[\d_]{4,}\b", "256", code))
 
 
-def test_shortens_large_numbers_alone():
+def test_shortens_large_numbers_and_searches_alone():
     assert shorten("learn(640_000, n_steps=9999), 10000, x_100000, 1e5") == "learn(256, n_steps=9999), 256, x_100000, 1e5"
+    assert shorten("optimize(n_trials=20), n=20") == "optimize(n_trials=2), n=20"
 
 
 @pytest.fixture

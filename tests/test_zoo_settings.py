@@ -1,6 +1,7 @@
 """The YAML files, and which of them the command line takes."""
 
 import ast
+import re
 from collections import OrderedDict
 
 import gymnasium as gym
@@ -27,7 +28,18 @@ from sb3_cchain.zoo.settings import (
 )
 from tests.envs import RandomEnv
 from tests.extras import NO_WHEELS
-from tests.zoo_command import DMC, ENV_IDS, FAST, GYM_CONTROL, NO_EVALUATION, PROCGEN, SHORT_PPO, command, shipped_settings
+from tests.zoo_command import (
+    DMC,
+    ENV_IDS,
+    FAST,
+    GYM_CONTROL,
+    NO_EVALUATION,
+    PROCGEN,
+    ROOT,
+    SHORT_PPO,
+    command,
+    shipped_settings,
+)
 
 # Algorithms of which RL Zoo has no settings
 NEW_ALGOS = ["ppo_cchain", "dqn_cchain", "double_dqn"]
@@ -49,6 +61,24 @@ def algos_of(suite):
     """Names on the command line of the algorithms that train in a suite, with and without churn reduction."""
     stock = ["dqn"] if suite == "minatar" else []
     return [*stock, *(suite_methods(suite)[name].algo for name in ("vanilla", "cchain"))]
+
+
+def test_quickstart_has_the_shipped_settings_in_python(tmp_path):
+    section = (ROOT / "docs" / "quickstart.md").read_text().partition("### In Python")[2]
+    snippet = re.search(r"```python\n(.*?)```", section, flags=re.DOTALL)[1]
+    kwargs = "env_kwargs=dict(n_tasks=2, steps_per_task=800)"
+    shorter = snippet.replace('"Continual/Acrobot-v1", ', f'"Continual/Acrobot-v1", {kwargs}, ').replace("1_600_000", "1600")
+    names = {"CChainPPO": CChainPPO}
+    exec(shorter, names)
+    train(tmp_path, "ppo_cchain", "Continual/Acrobot-v1", 1600, "--env-kwargs", "n_tasks:2", "steps_per_task:800")
+    (saved,) = tmp_path.rglob("Continual-Acrobot-v1.zip")
+    from_command = CChainPPO.load(saved)
+    assert from_command.num_timesteps == names["model"].num_timesteps == 1600
+    # What makes no difference so early
+    for name in ("churn_warmup", "churn_window", "churn_coef_min", "reset_churn_coef", "gamma", "gae_lambda"):
+        assert getattr(from_command, name) == getattr(names["model"], name), name
+    for name, parameter in from_command.policy.state_dict().items():
+        assert th.equal(parameter, names["model"].policy.state_dict()[name]), name
 
 
 def test_every_environment_has_settings():
