@@ -2,7 +2,8 @@
 What README and documentation show works as it stands there.
 
 Three things are shortened. Every number from 10 000 on, such as the length of a training, becomes 256; a search has two
-trials; and a rollout has 128 steps. Python snippets of a page run in order and share their names; a test among them is run as well.
+trials; and a rollout has 128 steps. Python snippets of a page run in order and share their names; a test among them is run
+as well.
 """
 
 import argparse
