@@ -4,6 +4,7 @@ import os
 import shlex
 import shutil
 import signal
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -67,6 +68,11 @@ def kill():
     raise Killed
 
 
+def origin_of(run):
+    """The checkpoint that a run went on from."""
+    return (run / (run / "resumed_from").read_text().strip()).resolve()
+
+
 def content(folder):
     """Of all files in it."""
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -109,7 +115,7 @@ def test_training_that_was_killed_goes_on_exactly(tmp_path, at_step, algo, cls, 
     assert_same_end(tmp_path, 1, 3, cls, algo)
     assert content(killed) == before
     resumed = run_folder(tmp_path, 3, algo)
-    assert (resumed / "resumed_from").read_text() == f"{killed / 'checkpoints' / folders[-1]}\n"
+    assert origin_of(resumed) == killed / "checkpoints" / folders[-1]
     # As many and as often as before
     assert len(list((resumed / "checkpoints").glob("step_*"))) >= 1
     # Once more, from an older one, less often
@@ -248,7 +254,36 @@ def test_the_last_run_is_that_of_the_environment_and_the_algorithm(checkpoints, 
         shutil.copytree(checkpoints, parent / name)
     (parent / f"{NAME}_12").mkdir()
     train(tmp_path, "--checkpoint-freq", 32, "--resume", "last", n=160, evaluation=NO_EVALUATION)
-    assert (run_folder(tmp_path, 13) / "resumed_from").read_text().startswith(f"{parent / NAME}_10/")
+    assert origin_of(run_folder(tmp_path, 13)).is_relative_to(f"{parent / NAME}_10")
+
+
+def test_a_log_folder_that_was_moved(tmp_path, at_step):
+    """The second run, killed before it made a checkpoint, went on from one of the first."""
+    job = ("--checkpoint-freq", 64, "--resume", "last")
+    for where, step in ((tmp_path / "old", 80), (tmp_path / "old", 90)):
+        at_step(step, kill)
+        with pytest.raises(Killed):
+            train(where, *job)
+    shutil.copytree(tmp_path / "old", tmp_path / "new")
+    at_step(0, kill)
+    train(tmp_path / "new", *job)
+    (saved,) = run_folder(tmp_path / "new", 1).glob("checkpoints/step_*")
+    origin = run_folder(tmp_path / "new", 3) / "resumed_from"
+    assert (origin.parent / origin.read_text().strip()).resolve() == saved
+    # As a machine that stops may leave it
+    os.remove(run_folder(tmp_path / "new", 3) / f"{NAME}.zip")
+    shutil.rmtree(run_folder(tmp_path / "new", 3) / "checkpoints")
+    origin.write_text("")
+    train(tmp_path / "new", *job)
+    assert origin_of(run_folder(tmp_path / "new", 4)) == saved
+
+
+def test_a_run_that_another_process_trains(checkpoints, tmp_path, monkeypatch):
+    run = tmp_path / "logs" / "ppo_cchain" / f"{NAME}_1"
+    shutil.copytree(checkpoints, run)
+    monkeypatch.setattr("fcntl.flock", mock.Mock(side_effect=BlockingIOError))
+    with pytest.raises(SystemExit, match=f"--resume last: another process is training in {run}"):
+        train(tmp_path, "--checkpoint-freq", 32, "--resume", "last", n=160, evaluation=NO_EVALUATION)
 
 
 def test_a_run_that_ended_before_its_first_checkpoint(tmp_path, at_step):

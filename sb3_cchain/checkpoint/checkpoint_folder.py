@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
@@ -30,6 +31,7 @@ from sb3_cchain.validation import check_path
 # Of the files. A later version of the package reads it, or says that it does not
 FORMAT = 3
 INFO, MODEL, STATE = "checkpoint.json", "model.zip", "training.pkl"
+LOCK = ".lock"
 PACKAGES = ("sb3-cchain", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy")
 
 
@@ -48,8 +50,10 @@ class Checkpoint:
             file = self.path / name
             if not file.is_file() or _hash(file) != expected:
                 raise ValueError(f"{self.path} is damaged: {name} is missing, or is not what was written")
-        if not self.store.has(self.info["chunks"]):
-            raise ValueError(f"{self.path} is damaged: pieces of its arrays are missing in {self.store.folder}")
+        try:
+            self.store.check(self.info["chunks"])
+        except ValueError as error:
+            raise ValueError(f"{self.path} is damaged: {error}") from error
 
     @property
     def folder(self) -> Path:
@@ -179,6 +183,20 @@ def has_checkpoint(path: str | Path) -> bool:
     return bool(_step_folders(Path(path)))
 
 
+def is_being_written(path: Path) -> bool:
+    """
+    :param path: A folder of checkpoints, which need not exist
+    :return: Whether the training of another process writes to it
+    """
+    try:
+        open_locked(path / LOCK, "").close()
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        return True
+    return False
+
+
 def _whole(path: Path) -> Checkpoint | None:
     try:
         return Checkpoint(path)
@@ -187,8 +205,13 @@ def _whole(path: Path) -> Checkpoint | None:
 
 
 def _step_folders(folder: Path) -> list[Path]:
-    """The checkpoints in a folder, the newest first."""
-    return sorted(folder.glob("step_*"), reverse=True)
+    """The checkpoints in a folder, the newest first. Another name, such as that of a copy, is somebody else's."""
+    found = [path for path in folder.glob("step_*") if re.fullmatch(r"step_\d{12,}", path.name)]
+    return sorted(found, key=_step, reverse=True)
+
+
+def _step(folder: Path) -> int:
+    return int(folder.name.removeprefix("step_"))
 
 
 def chunk_store(folder: Path) -> ChunkStore:
@@ -216,7 +239,7 @@ class CheckpointFolder:
         except OSError as error:
             raise ValueError(f"`path` must be a folder that can be written to, got {str(path)!r}: {error}") from error
         message = f"Another process is writing checkpoints to {path}. Give each training a `path` of its own."
-        self._lock: TextIO = open_locked(path / ".lock", message)
+        self._lock: TextIO = open_locked(path / LOCK, message)
         try:
             self._check_newest(newest)
         except ValueError:
@@ -233,7 +256,7 @@ class CheckpointFolder:
                 "resume(), or with the same model by learn(..., reset_num_timesteps=False), give another path, or move them "
                 "away."
             )
-        later = [folder for folder in there if newest is not None and folder.name > step_name(newest)]
+        later = [folder for folder in there if newest is not None and _step(folder) > newest]
         for folder in [folder for folder in later if _whole(folder) is None]:
             # In place of which an older one was taken
             aside = folder.with_name(f"damaged_{folder.name}")
@@ -265,16 +288,28 @@ class CheckpointFolder:
             return target
         unfinished = self.path / f".{target.name}"
         unfinished.mkdir()
-        with write_safely(unfinished / MODEL) as path:
-            save_model(path)
-        with write_safely(unfinished / STATE) as path, open(path, "wb") as file:
-            pickle.dump(state, file, protocol=5)
-        files = {name: _hash(unfinished / name) for name in (MODEL, STATE)}
-        write_info(unfinished, {"format": FORMAT, **info, "files": files})
-        os.rename(unfinished, target)
+        try:
+            with write_safely(unfinished / MODEL) as path:
+                save_model(path)
+            with write_safely(unfinished / STATE) as path, open(path, "wb") as file:
+                pickle.dump(state, file, protocol=5)
+            files = {name: _hash(unfinished / name) for name in (MODEL, STATE)}
+            write_info(unfinished, {"format": FORMAT, **info, "files": files})
+            os.rename(unfinished, target)
+        except BaseException:  # it would fill a disk that is full already
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
         sync_folder(self.path)
         self._remove_old()
         return target
+
+    def remove_useless_chunks(self) -> None:
+        """Remove the pieces of big arrays that no checkpoint needs, as of one that could not be written."""
+        needed: set[str] = set()
+        for folder in _step_folders(self.path):
+            with suppress(ValueError):  # a damaged one, which is of no use any more
+                needed.update(_read_info(folder)["chunks"])
+        self.store.remove_all_but(needed)
 
     def _remove_old(self) -> None:
         folders = _step_folders(self.path)
@@ -283,11 +318,7 @@ class CheckpointFolder:
             hidden = folder.with_name(f".{folder.name}")
             os.rename(folder, hidden)
             shutil.rmtree(hidden)
-        needed: set[str] = set()
-        for folder in folders[: self.keep]:
-            with suppress(ValueError):  # a damaged one, which is of no use any more
-                needed.update(_read_info(folder)["chunks"])
-        self.store.remove_all_but(needed)
+        self.remove_useless_chunks()
 
     def close(self) -> None:
         """Let others write to it."""
@@ -358,8 +389,13 @@ def write_info(path: Path, info: Mapping[str, Any]) -> None:
 
 def _info_text(info: Mapping[str, Any]) -> str:
     """The file's content, with a checksum of the rest."""
-    checksum = hashlib.sha256(json.dumps(info).encode()).hexdigest()
-    return json.dumps({**info, "checksum": checksum}, indent=1) + "\n"
+    checksum = hashlib.sha256(json.dumps(info, default=_plain).encode()).hexdigest()
+    return json.dumps({**info, "checksum": checksum}, indent=1, default=_plain) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers, and paths, that were given as arguments."""
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def _hash(file: Path) -> str:

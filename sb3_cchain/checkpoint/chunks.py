@@ -44,21 +44,26 @@ class ChunkStore:
         """
         data = bytearray()
         for name in names:
-            try:
-                chunk = zlib.decompress(self._path(name).read_bytes())
-            except (OSError, zlib.error) as error:
-                raise ValueError(f"{self._path(name)} is missing or damaged: {error}") from error
-            if hashlib.blake2b(chunk, digest_size=20).hexdigest() != name:
-                raise ValueError(f"{self._path(name)} is damaged: its content is not what its name says")
-            data += chunk
+            data += self._read(name)
         return data
 
-    def has(self, names: Sequence[str]) -> bool:
+    def check(self, names: Sequence[str]) -> None:
         """
         :param names: Names of pieces
-        :return: Whether all of them are there
+        :raises ValueError: When a piece is missing or damaged
         """
-        return all(self._path(name).exists() for name in names)
+        for name in names:
+            self._read(name)
+
+    def _read(self, name: str) -> bytes:
+        path = self._path(name)
+        try:
+            chunk = zlib.decompress(path.read_bytes())
+        except (OSError, zlib.error) as error:
+            raise ValueError(f"{path} is missing or damaged: {error}") from error
+        if hashlib.blake2b(chunk, digest_size=20).hexdigest() != name:
+            raise ValueError(f"{path} is damaged: its content is not what its name says")
+        return chunk
 
     def remove_all_but(self, names: Collection[str]) -> None:
         """

@@ -42,6 +42,7 @@ def further_logger(saved: Mapping[str, Any], num_timesteps: int) -> Logger | Non
     :param num_timesteps: Environment steps at which training goes on
     :return: A logger that writes in the same formats to the same folder, in new files as far as Stable-Baselines3 would
         overwrite them; None when a loaded model has the same logger by itself
+    :raises ValueError: When that folder cannot be made
     """
     if saved["others"]:
         warnings.warn(
@@ -51,7 +52,11 @@ def further_logger(saved: Mapping[str, Any], num_timesteps: int) -> Logger | Non
     folder = saved["folder"]
     if folder is None:
         return None
-    return Logger(folder, [make_output_format(name, folder, f"_from_step_{num_timesteps}") for name in saved["formats"]])
+    try:
+        outputs = [make_output_format(name, folder, f"_from_step_{num_timesteps}") for name in saved["formats"]]
+    except OSError as error:
+        raise ValueError(f"The training logged to {folder}, which cannot be made here ({error}): give `logger`") from error
+    return Logger(folder, outputs)
 
 
 def _format(output: KVWriter) -> str | None:

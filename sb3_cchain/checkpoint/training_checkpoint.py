@@ -53,7 +53,8 @@ class TrainingCheckpoint(BaseCallback):
     It acts at the start of a rollout, after the updates that follow the rollout before: when ``save_freq`` more steps were
     made, and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it
     ends the training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and
-    learned from before that. A second signal ends the training at once. In the last rollout, the first signal changes nothing:
+    learned from before that. A second Ctrl-C ends the training at once; a second SIGTERM, which schedulers send, changes
+    nothing. In the last rollout, the first signal changes nothing:
     ``learn()`` is complete then. A further call that goes on with the training stops at its start.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
@@ -80,10 +81,10 @@ class TrainingCheckpoint(BaseCallback):
         check_number("save_freq", save_freq, 1, integer=True)
         check_number("keep", keep, 1, integer=True)
         check_bool("exact", exact)
-        self.save_freq = save_freq
+        self.save_freq = int(save_freq)
         self.path = check_path("path", path)
-        self.keep = keep
-        self.exact = exact
+        self.keep = int(keep)
+        self.exact = bool(exact)
         # How to go on, as it is printed when training was told to stop
         self.advice = f'Go on from there: sb3_cchain.resume("{path}", env=...)'
         self._resumed: Checkpoint | None = None
@@ -218,6 +219,8 @@ class TrainingCheckpoint(BaseCallback):
             try:
                 self._save()
             except OSError as error:
+                assert self._folder is not None
+                self._folder.remove_useless_chunks()
                 warnings.warn(
                     f"No checkpoint was saved at step {self.num_timesteps}: {error}. Training goes on, and the next rollout "
                     "tries again."
@@ -289,18 +292,23 @@ class TrainingCheckpoint(BaseCallback):
 
     def _stop(self) -> None:
         """End the training, as the signal would have."""
-        saved = self._save() if self._can_save() else None
+        saved, reason = None, "it is in an episode whose beginning was not recorded"
+        if self._can_save():
+            try:
+                saved = self._save()
+            except OSError as error:
+                reason = str(error)
         self._release()
         stopped = f"Training was stopped at step {self.num_timesteps}"
-        if saved is None:
-            newest = (
-                f"The last checkpoint is of step {self._last_saved}" if has_checkpoint(self.path) else "There is no checkpoint"
-            )
+        if saved is not None:
+            print(f"{stopped} and saved to {saved}. {self.advice}", flush=True)
+        elif has_checkpoint(self.path):
             print(
-                f"{stopped}, in an episode whose beginning was not recorded, so that it was not saved. {newest}.", flush=True
+                f"{stopped} and not saved: {reason}. The last checkpoint is of step {self._last_saved}. {self.advice}",
+                flush=True,
             )
         else:
-            print(f"{stopped} and saved to {saved}. {self.advice}", flush=True)
+            print(f"{stopped} and not saved: {reason}. There is no checkpoint", flush=True)
         number, self._stop_signal = self._stop_signal, None
         self._note_progress()
         if number == signal.SIGTERM:
@@ -314,10 +322,13 @@ class TrainingCheckpoint(BaseCallback):
             self._replaced_handlers = {number: signal.signal(number, self._on_signal) for number in heeded}
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._stop_signal is None and _is_learning(self.model, frame):
-            self._stop_signal = number
-            print("Stopping when this rollout has been learned from and saved. Stop at once: Ctrl-C again", flush=True)
-            return
+        if _is_learning(self.model, frame):
+            if self._stop_signal is None:
+                self._stop_signal = number
+                print("Stopping when this rollout has been learned from and saved. Stop at once: Ctrl-C again", flush=True)
+                return
+            if number == signal.SIGTERM:  # a job may get it several times, from the scheduler and from its own script
+                return
         # Where the former handler lets training go on, it is still stopped after this rollout
         self._restore_handlers()
         os.kill(os.getpid(), number)

@@ -1,6 +1,7 @@
 """The options of ``sb3-cchain train`` that RL Zoo does not have: checkpoints, and training that goes on exactly from one."""
 
 import argparse
+import os
 import re
 import shlex
 import sys
@@ -9,7 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint, is_being_written
+from sb3_cchain.checkpoint.files import write_safely
 from sb3_cchain.zoo.training_record import COMMAND, read_record
 
 # In a run folder
@@ -136,7 +138,10 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     :raises SystemExit: When there is no whole checkpoint, unless ``last`` is asked for
     """
     if options.resume == LAST:
-        options = options._replace(resume=find_last_run(arguments))
+        last = find_last_run(arguments)
+        if last is not None and is_being_written(last / CHECKPOINTS):
+            sys.exit(f"--resume last: another process is training in {last}")
+        options = options._replace(resume=last)
     if options.resume is None:
         return options._replace(keep=options.keep or KEEP), arguments
     try:
@@ -172,14 +177,33 @@ def find_last_run(arguments: Sequence[str]) -> Path | None:
         folder: int(match[1])
         for folder in (given.log_folder / given.algo).glob("*")
         if (match := runs.fullmatch(folder.name))
-        and (has_checkpoint(folder / CHECKPOINTS) or (folder / RESUMED_FROM).is_file())
+        and (has_checkpoint(folder / CHECKPOINTS) or _resumed_from(folder) is not None)
     }
     return max(numbers, key=numbers.__getitem__, default=None)
 
 
+def write_resumed_from(run: Path, checkpoint: Path) -> None:
+    """
+    :param run: A run folder
+    :param checkpoint: The checkpoint that its training goes on from. One in the folder beside it is found there also after
+        both were moved
+    """
+    checkpoint = checkpoint.resolve()
+    is_beside = checkpoint.is_relative_to(run.resolve().parent)
+    with write_safely(run / RESUMED_FROM) as file:
+        file.write_text(f"{os.path.relpath(checkpoint, run.resolve()) if is_beside else checkpoint}\n")
+
+
+def _resumed_from(run: Path) -> Path | None:
+    """The checkpoint that the training in a run folder went on from."""
+    file = run / RESUMED_FROM
+    name = file.read_text().strip() if file.is_file() else ""
+    return run / name if name else None
+
+
 def _where_to_look(resume: Path) -> Path:
     """For a run folder its checkpoints, or those that the run itself went on from, if it was killed before it saved one."""
-    inside, resumed_from = resume / CHECKPOINTS, resume / RESUMED_FROM
-    if not has_checkpoint(inside) and resumed_from.is_file():
-        return Path(resumed_from.read_text().strip())
+    inside, resumed_from = resume / CHECKPOINTS, _resumed_from(resume)
+    if not has_checkpoint(inside) and resumed_from is not None:
+        return resumed_from.resolve()
     return inside if inside.is_dir() else resume

@@ -37,7 +37,7 @@ from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
-from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions
+from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, write_resumed_from
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
 from sb3_cchain.zoo.settings import missing_parts, settings_path
 from sb3_cchain.zoo.statistics import statistics_path
@@ -146,7 +146,7 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             freq, keep = self.checkpoints.freq, self.checkpoints.keep
             write_record(self.checkpoint_folder, freq, keep, self.args, self._hyperparameters_read)
         if self.resumed is not None:
-            (Path(self.save_path) / RESUMED_FROM).write_text(f"{self.resumed.path.resolve()}\n")
+            write_resumed_from(Path(self.save_path), self.resumed.path)
             self._copy_best(self.resumed.folder.parent)
 
     def _check_resumed(self, checkpoint: Checkpoint) -> None:
