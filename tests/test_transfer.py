@@ -9,7 +9,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, transfer
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, transfer
 from sb3_cchain.analysis import NetworkHealth
 from sb3_cchain.methods import TRAC, Oracle
 from sb3_cchain.networks import InjectionPolicy, LayerNormPolicy
@@ -184,6 +184,15 @@ def test_with_callbacks_wrappers_and_other_policies():
     parameter = dict(model.policy.named_parameters())[next(name for name in kept if name.endswith("weight"))]
     assert model.policy.optimizer.state[parameter]["step"] > 0
     model.learn(32, callback=[NetworkHealth(interval=1), CChainCallback()], reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, DQN])
+def test_churn_is_monitored_on_observations_of_the_new_environment(algorithm):
+    model = trained(algorithm)
+    model.learn(32, callback=ChurnMonitor(interval=1, batch_size=8), reset_num_timesteps=False)
+    transfer(model, gym.make("Acrobot-v1"))
+    model.learn(32, callback=ChurnMonitor(interval=1, batch_size=8), reset_num_timesteps=False)
+    assert model.churn_monitor_batch["observations"].shape == (8, 6)
 
 
 def test_normalised_and_several_environments():

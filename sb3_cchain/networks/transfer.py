@@ -16,8 +16,9 @@ from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.validation import check_bool
 
-# Attributes that callbacks keep with a model: the state of churn reduction, and the parameters that training began with
-OF_FORMER_NETWORKS = ("churn_state", "initial_parameters")
+# Attributes that callbacks keep with a model: the state of churn reduction, the parameters that training began with, and the
+# fixed batch of ChurnMonitor
+OF_FORMER_NETWORKS = ("churn_state", "initial_parameters", "churn_monitor_batch")
 
 
 class Transferred(NamedTuple):
