@@ -40,7 +40,7 @@ def main() -> None:
             for seed in args.seeds
             for method in ("vanilla", "cchain")
         ]
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.error(str(error))
     console = Console()
     console.print(f"{demo.env_id}: {n_tasks} tasks of {steps} steps. {demo.explanation}")

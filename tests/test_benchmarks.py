@@ -10,6 +10,7 @@ from benchmarks import compare, demo, references
 from benchmarks.grid.executor import LocalBackend
 from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, make_run
+from benchmarks.grid.suites import paper_length
 from benchmarks.report.random_policy import look_at_task
 from tests.extras import needs_dm_control
 from tests.fake_training import fake_program
@@ -111,6 +112,14 @@ def test_errors_come_before_any_work(run_command, tmp_path, capsys, command, arg
     captured = capsys.readouterr().err
     assert error.value.code == 2 and message.split(".*")[0] in captured and message.split(".*")[-1] in captured
     assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_package_is_said_in_a_line(run_command, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "minatar.gym", None)
+    paper_length.cache_clear()
+    with pytest.raises(SystemExit):
+        run_command(demo, ["--suite", "minatar"])
+    assert "MinAtar is not installed" in capsys.readouterr().err
 
 
 def test_what_the_commands_do_not_need():

@@ -1,6 +1,7 @@
 """The command ``benchmarks.sensitivity``: what it trains, and its tables and picture of made-up results."""
 
 from functools import partial
+from unittest.mock import Mock
 
 import pytest
 
@@ -100,6 +101,13 @@ def test_a_value_that_is_not_tried(tmp_path, capsys):
     with pytest.raises(SystemExit) as error:
         command(tmp_path, "--value", "3")
     assert error.value.code == 2 and "--value must be one of 1e2, 1e3, " in capsys.readouterr().err
+
+
+def test_a_missing_package_is_said_in_a_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("benchmarks.sensitivity.__main__.all_runs", Mock(side_effect=ImportError("Box2D is missing")))
+    with pytest.raises(SystemExit):
+        command(tmp_path)
+    assert "Box2D is missing" in capsys.readouterr().err
 
 
 # --- Cost ---------------------------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     try:
         runs = all_runs(args.parameter, args.value, args.env, args.seeds, args.budget)
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.error(str(error))
     if args.dry_run:
         list_grid(runs, args.results, args.logs, Console())
