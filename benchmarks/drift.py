@@ -188,7 +188,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for world, seed in _runs(args.worlds, args.seeds):
         path = _folder(folder, world) / f"seed_{seed}.csv"
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
             write(path, train(world, seed, args.steps_per_task))
             print(f"{world}, seed {seed}: done", flush=True)
     # All that is there, with what was made before

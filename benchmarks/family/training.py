@@ -189,7 +189,6 @@ def _write(run: Run, evaluation: EvalCallback, churn_log: ChurnLog) -> None:
         columns["success_rate"] = np.mean(evaluation.evaluations_successes, axis=1).tolist()
     if run.case.monitor is not None:
         columns.update(churn_log.churn)
-    run.result.parent.mkdir(parents=True, exist_ok=True)
     with write_safely(run.result) as path, open(path, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)

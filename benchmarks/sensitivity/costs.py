@@ -58,7 +58,6 @@ def measure(path: Path, n_rounds: int = N_ROUNDS, env_ids: tuple[str, ...] = ENV
             for name, model in models.items():
                 per_1000 = 1000 * seconds(partial(iteration, model)) / model.n_steps
                 rows.append((env_id, name, number, f"{per_1000:.4f}"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     with write_safely(path) as unfinished, open(unfinished, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
