@@ -9,8 +9,9 @@ switch when it is the first one after it and comes within half a task. All other
 import argparse
 import csv
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -185,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     folder = args.output / f"drift_{N_TASKS}x{args.steps_per_task}"
-    for world, seed in _runs(args.worlds, args.seeds):
+    for world, seed in product(args.worlds, args.seeds):
         path = _folder(folder, world) / f"seed_{seed}.csv"
         if not path.exists():
             write(path, train(world, seed, args.steps_per_task))
@@ -203,10 +204,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _folder(folder: Path, world: str) -> Path:
     return folder / world.replace(",", "").replace(" ", "_")
-
-
-def _runs(worlds: Iterable[str], seeds: Sequence[int]) -> list[tuple[str, int]]:
-    return [(world, seed) for world in worlds for seed in seeds]
 
 
 if __name__ == "__main__":

@@ -164,7 +164,7 @@ class Training:
             seconds=max(round(seconds, 1), 0.1),  # by which rates are divided
             peak_memory=self._memory,
         )
-        suite, evaluations = SUITES[run.suite], self._evaluations()
+        suite, evaluations = SUITES[run.suite], self._rows(EVALUATIONS_CSV)
         if suite.evaluates:
             return Finished(result, evaluations, metrics_rows(chain))
         # Evaluations are in the log at the end of the next rollout, which may be in the next task
@@ -184,10 +184,6 @@ class Training:
     def _training_returns(self) -> list[dict[str, float]]:
         """Rows of ``returns.csv`` so far."""
         return self._rows(RETURNS_CSV)
-
-    def _evaluations(self) -> list[dict[str, float]]:
-        """Rows of ``evaluations.csv``, where the suite evaluates."""
-        return self._rows(EVALUATIONS_CSV)
 
     def _rows(self, name: str) -> list[dict[str, float]]:
         files = list(self.folder.glob(f"tensorboard/*/*/{name}"))

@@ -61,7 +61,8 @@ def _draw(
             panel.plot([place], [mean], "_", color=cchain.color, markersize=14, markeredgewidth=2)
         else:
             panel.axvspan(place - 0.4, place + 0.4, color="0.93", zorder=0)
-            panel.text(place, 0.97, "no run", color="0.5", rotation=90, ha="center", va="top", **_across(panel))
+            across = panel.get_xaxis_transform()  # heights from 0 to 1
+            panel.text(place, 0.97, "no run", color="0.5", rotation=90, ha="center", va="top", transform=across)
     if base:
         panel.axhline(np.mean(list(base.values())), color=ppo.color, linestyle="--", linewidth=1.2, label=f"{ppo.label}, mean")
     for score in base.values():
@@ -76,8 +77,3 @@ def _draw(
     panel.set_xlim(-0.6, len(labels) - 0.4)
     panel.set_xlabel(f"{parameter.label}\nand time of an iteration / PPO's" if costs else parameter.label)
     panel.spines[["top", "right"]].set_visible(False)
-
-
-def _across(panel: Any) -> dict[str, Any]:
-    """Heights from 0 to 1."""
-    return {"transform": panel.get_xaxis_transform()}
