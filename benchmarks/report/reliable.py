@@ -24,7 +24,7 @@ each environment. An environment in which the paper's means lie close together, 
 do, and the IQM less."""
 
 # Of fewer seeds the report says that the bootstrap's intervals are too narrow
-ENOUGH_SEEDS = 5
+BOOTSTRAP_SEEDS = 5
 
 FEW_SEEDS = """\
 In this section the intervals of fewer than five seeds, here those of {methods}, are too narrow: they hold the true value less
@@ -64,7 +64,7 @@ def reliable_section(suite: str, cells: Cells, paper: Table, pictures: Pictures)
         + (f"Left out, because they do not have runs in all of them: {', '.join(without)}. " if without else "")
         + NORMALIZATION
     )
-    few = [method_label(suite, method) for method in several if len(seeds[method]) < ENOUGH_SEEDS]
+    few = [method_label(suite, method) for method in several if len(seeds[method]) < BOOTSTRAP_SEEDS]
     scaled = {method: normalized(matrix, low, high) for method, matrix in scores.items()}
     return [
         "### Over the environments",
