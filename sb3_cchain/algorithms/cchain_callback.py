@@ -14,8 +14,8 @@ from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
+from sb3_cchain.networks.algorithm_kinds import is_trpo
 from sb3_cchain.networks.lean_distributions import make_lean
-from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview

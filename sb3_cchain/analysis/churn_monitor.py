@@ -15,8 +15,9 @@ from sb3_cchain.analysis.model_outputs import ModelOutputs, churn, known_kind, m
 from sb3_cchain.analysis.reference_batch import map_batch, sample_batch
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.checkpoint.random_state import unchanged_random_state
+from sb3_cchain.networks.algorithm_kinds import is_trpo
 from sb3_cchain.networks.batch_outputs import Batch
-from sb3_cchain.networks.model_optimizers import is_trpo, model_optimizers
+from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 

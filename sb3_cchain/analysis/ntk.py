@@ -14,6 +14,7 @@ from torch import nn
 from sb3_cchain.algorithms.replay_observations import unchanged
 from sb3_cchain.analysis.metrics.gradients import Objective, minibatch_gradients
 from sb3_cchain.analysis.metrics.ntk import gram_matrix
+from sb3_cchain.networks.algorithm_kinds import is_recurrent
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 
 
@@ -23,7 +24,7 @@ def has_ntk(model: BaseAlgorithm) -> bool:
     :return: Whether its NTK can be computed: of on-policy algorithms without recurrent networks, DQN and QRDQN
     """
     is_known = isinstance(model, (OnPolicyAlgorithm, DQN)) or hasattr(model, "quantile_net")
-    return is_known and not hasattr(model, "_last_lstm_states")
+    return is_known and not is_recurrent(model)
 
 
 def policy_ntk(model: OnPolicyAlgorithm, n_minibatches: int = 100) -> th.Tensor:

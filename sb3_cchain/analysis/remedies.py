@@ -10,6 +10,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from sb3_cchain.networks import CReLU
+from sb3_cchain.networks.algorithm_kinds import is_recurrent
 from sb3_cchain.networks.model_optimizers import model_optimizers
 
 # By the names of the classes, as sb3-contrib need not be installed. A subclass of one of them counts as that one
@@ -129,7 +130,7 @@ def policy_alias(model: BaseAlgorithm) -> str:
     """
     space = model.observation_space
     kind = "MultiInput" if isinstance(space, spaces.Dict) else "Cnn" if is_image_space(space) else "Mlp"
-    return f"{kind}{'Lstm' if hasattr(model, '_last_lstm_states') else ''}Policy"
+    return f"{kind}{'Lstm' if is_recurrent(model) else ''}Policy"
 
 
 _OPTIMIZER = (

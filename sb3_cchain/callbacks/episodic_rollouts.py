@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cchain.callbacks.rollout_normalized_advantage import RolloutNormalizedAdvantage
+from sb3_cchain.networks.algorithm_kinds import is_recurrent
 from sb3_cchain.tasks.reset import reset_training_env
 
 
@@ -29,7 +30,7 @@ class EpisodicRollouts(RolloutNormalizedAdvantage):
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        if hasattr(self.model, "_last_lstm_states"):
+        if is_recurrent(self.model):
             raise TypeError(f"EpisodicRollouts does not know recurrent networks, got {type(self.model).__name__}")
 
     def _on_rollout_start(self) -> None:

@@ -10,6 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.methods.ewc import EWC
 from sb3_cchain.methods.optimizer_wrapper import nested_wrappers
+from sb3_cchain.networks.algorithm_kinds import is_recurrent
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
 from sb3_cchain.networks.model_optimizers import model_optimizers
@@ -59,7 +60,7 @@ class EWCConsolidation(TaskBoundary):
 
     def _init_callback(self) -> None:
         name = type(self.model).__name__
-        if not isinstance(self.model, (OnPolicyAlgorithm, DQN, SAC)) or hasattr(self.model, "_last_lstm_states"):
+        if not isinstance(self.model, (OnPolicyAlgorithm, DQN, SAC)) or is_recurrent(self.model):
             raise TypeError(f"EWCConsolidation is for PPO, A2C, DQN and SAC, got {name}")
         if isinstance(self.model, DQN) and not self.values:
             raise ValueError("`values` must be True for DQN, got False")

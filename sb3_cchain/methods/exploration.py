@@ -9,8 +9,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import forget_references
+from sb3_cchain.networks.algorithm_kinds import is_trpo
 from sb3_cchain.networks.compiled import uncompiled
-from sb3_cchain.networks.model_optimizers import is_trpo
 from sb3_cchain.replaced import replaced
 from sb3_cchain.tasks.boundary import TaskBoundary
 from sb3_cchain.validation import check_number

@@ -4,6 +4,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_cchain.networks.algorithm_kinds import is_recurrent
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.injection_policies import Injectable
 
@@ -17,7 +18,7 @@ def check_plain_networks(name: str, model: BaseAlgorithm) -> None:
     """
     if not isinstance(model, (OnPolicyAlgorithm, DQN)):
         raise TypeError(f"{name} is for on-policy algorithms and DQN, got {type(model).__name__}")
-    if hasattr(model, "_last_lstm_states"):
+    if is_recurrent(model):
         raise TypeError(f"{name} does not know recurrent networks, got {type(model).__name__}")
     policy = uncompiled(model.policy)
     if any(isinstance(module, Injectable) for module in policy.modules()):

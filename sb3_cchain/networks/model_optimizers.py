@@ -12,12 +12,3 @@ def model_optimizers(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
     owners = {"": model.policy, "actor": getattr(model.policy, "actor", None), "critic": getattr(model.policy, "critic", None)}
     optimizers = {name: getattr(owner, "optimizer", None) for name, owner in owners.items()}
     return {name: optimizer for name, optimizer in optimizers.items() if optimizer is not None}
-
-
-def is_trpo(model: BaseAlgorithm) -> bool:
-    """
-    :param model: A model
-    :return: Whether it is sb3-contrib's TRPO or a subclass of it, where the policy's optimiser does not make all changes
-    """
-    # By its name, as sb3-contrib need not be installed
-    return any(base.__name__ == "TRPO" for base in type(model).__mro__)
