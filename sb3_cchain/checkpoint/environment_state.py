@@ -68,15 +68,20 @@ def vec_env_parts(env: VecEnv, prefix: str = "") -> Parts:
     :return: The objects that have state in this process
     """
     layers = {f"{prefix}{name}": layer for name, layer in named_layers(env).items()}
-    # A monitor counts from its start in its file
-    skip: dict[str, Collection[str]] = {
-        name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()
-    }
-    parts = Parts(dict(layers), _known(layers), skip)
+    parts = Parts(dict(layers), _known(layers), no_state(layers))
     if isinstance(env.unwrapped, DummyVecEnv):
         for position, single in enumerate(env.unwrapped.envs):
             parts.add(environment_parts(single, f"{prefix}environment {position}, "))
     return parts
+
+
+def no_state(layers: Mapping[str, VecEnv]) -> dict[str, Collection[str]]:
+    """
+    :param layers: A vectorised environment and its wrappers, by name
+    :return: For each the attributes that are no state
+    """
+    # A monitor counts from its start in its file
+    return {name: (*NO_STATE, "t_start") if isinstance(layer, VecMonitor) else NO_STATE for name, layer in layers.items()}
 
 
 def check_same_environment(env: VecEnv, layers: Iterable[str], n_envs: int, saved_layers: Iterable[str]) -> None:

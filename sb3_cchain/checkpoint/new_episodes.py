@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_cchain.checkpoint.environment_state import NO_STATE, named_layers
+from sb3_cchain.checkpoint.environment_state import named_layers, no_state
 from sb3_cchain.checkpoint.object_state import object_states, restore_objects
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.reset import reset_training_env
@@ -23,11 +23,9 @@ def lasting_state(env: VecEnv, left_out: list[str]) -> dict[str, Any]:
         ``VecNormalize``, and how far its tasks are. None of an environment that stays on a task
     """
     wrappers = _wrappers(env)
-    # A monitor counts from its start in its file
-    skip = {name: (*NO_STATE, "t_start") for name in wrappers}
     clocks = env.get_attr("clock") if is_continual(env) else []
     return {
-        "wrappers": object_states(wrappers, _known(env), skip=skip, left_out=left_out),
+        "wrappers": object_states(wrappers, _known(env), skip=no_state(wrappers), left_out=left_out),
         "task_steps": [None if clock.is_pinned else clock.n_steps for clock in clocks],
     }
 
