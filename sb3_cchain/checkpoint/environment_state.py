@@ -6,6 +6,7 @@ from typing import Any
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor, VecVideoRecorder
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_cchain.checkpoint.object_state import has_state_dict
 from sb3_cchain.checkpoint.resumable_env import (
     RESUMED,
     Parts,
@@ -41,7 +42,7 @@ def prepare_environment(env: VecEnv) -> None:
             fault, resumable = attempt(make_resumable, single)
             _raise(position, fault)
             base.envs[position] = resumable
-    elif not _has_own_state(base):
+    elif not has_state_dict(type(base)):
         raise ValueError(
             f"{type(base).__name__} cannot be resumed, because its state is not known. Give the class `state_dict()` and "
             "`load_state_dict(state)`, or use DummyVecEnv or SubprocVecEnv"
@@ -156,10 +157,6 @@ def _known(layers: Mapping[str, VecEnv]) -> dict[str, object]:
     *_, (base_name, base) = layers.items()
     # Not the empty tuple, which is one object wherever it stands
     return {f"{base_name} {name}": value for name in ENVIRONMENTS if (value := vars(base).get(name))}
-
-
-def _has_own_state(env: VecEnv) -> bool:
-    return hasattr(type(env), "state_dict") and hasattr(type(env), "load_state_dict")
 
 
 def _check_outermost(env: SubprocVecEnv) -> None:

@@ -259,7 +259,7 @@ class _Reader:
     def _enter(self, owner: int, name: str, value: object, kind: str | None) -> None:
         number = self._references[id(value)] = len(self.entries)
         # This package's own, such as an open file of returns, are there where they are needed
-        is_needed = _has_state_dict(type(value)) and _package(type(value)) != "sb3_cchain"
+        is_needed = has_state_dict(type(value)) and _package(type(value)) != "sb3_cchain"
         self.entries.append(Entry(owner, name, kind, is_needed))
         self._paths.append(self._path(owner, name))
         self._strict.append(self._strict[owner])
@@ -410,7 +410,7 @@ def _is_code(value: object) -> bool:
 
 def _own_state(value: Any) -> _OwnState | None:
     kind = type(value)
-    if _has_state_dict(kind):
+    if has_state_dict(kind):
         return _OwnState(kind, kind.state_dict, kind.load_state_dict)
     for own in _CONTAINERS:
         if kind is own.kind:
@@ -418,8 +418,11 @@ def _own_state(value: Any) -> _OwnState | None:
     return next((own for own in _OWN_STATES if isinstance(value, own.kind)), None)
 
 
-def _has_state_dict(kind: type) -> bool:
-    # Asked of the class, because wrappers may pass on what their objects are asked for
+def has_state_dict(kind: type) -> bool:
+    """
+    :param kind: A class
+    :return: Whether its objects know their state. Asked of the class, because wrappers pass on what they are asked for
+    """
     return hasattr(kind, "state_dict") and hasattr(kind, "load_state_dict")
 
 
