@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from collections.abc import Sequence
 from html import escape
 from string import Template
@@ -67,8 +68,8 @@ def html_report(inspections: Sequence[Inspection], title: str, with_picture: boo
 
 def _section(inspection: Inspection) -> str:
     about = f"{inspection.algorithm}, {inspection.num_timesteps} environment steps of training"
-    mean_return = inspection.figures.get("rollout/mean_return")
-    if mean_return is not None and mean_return == mean_return:  # a number
+    mean_return = inspection.figures.get("rollout/mean_return", math.nan)
+    if not math.isnan(mean_return):
         about += f"; mean return {number(mean_return)} in {inspection.figures['rollout/n_episodes']:.0f} episodes"
     return "\n".join(
         [

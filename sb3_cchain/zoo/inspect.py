@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
@@ -15,7 +14,7 @@ from rich.console import Console
 from rl_zoo3 import ALGOS
 from rl_zoo3.utils import StoreDict
 
-from sb3_cchain.analysis.findings import BY_NAME, CERTAINTIES
+from sb3_cchain.analysis.findings import BY_NAME, CERTAINTIES, as_json
 from sb3_cchain.analysis.inspection import Inspection, inspect_model
 from sb3_cchain.analysis.inspection_report import findings_text, plot, report
 from sb3_cchain.analysis.report_page import html_report
@@ -189,8 +188,7 @@ def _forget_task(model: Any, callbacks: Sequence[Any]) -> None:
 def _write(args: argparse.Namespace, inspections: Sequence[Inspection]) -> list[Path]:
     """The files, and their names."""
     figures = [
-        # JSON has neither infinity nor NaN
-        {"model": str(path), **{tag: value if math.isfinite(value) else None for tag, value in inspection.figures.items()}}
+        {"model": str(path), **{tag: as_json(value) for tag, value in inspection.figures.items()}}
         for path, inspection in zip(args.models, inspections, strict=True)
     ]
     written = [args.output / "inspection.json"]
