@@ -61,10 +61,9 @@ def make_as_trained(
         vec_env_cls=DummyVecEnv,
     )
     normalize = unwrap_vec_normalize(env)
-    if normalize is not None:
-        normalize.training, normalize.norm_reward = True, norm_reward
     if normalize is None:
         return (env if statistics is None else VecNormalize.load(str(statistics), env)), callbacks
+    normalize.training, normalize.norm_reward = True, norm_reward
     if statistics is None and is_deep:
         raise ValueError(
             "it was trained with normalisation, and its statistics are within the checkpoint: give a file of them as "
