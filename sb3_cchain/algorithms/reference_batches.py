@@ -118,8 +118,10 @@ class ReferenceMinibatches:
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> Any:
         """As of :class:`RolloutReferences`."""
         sample = self._sample
-        if sample is None or not needs:
-            return sample and sample.observations
+        if sample is None:
+            return None
+        if not needs:
+            return sample.observations
         batch = {name: getattr(sample, name) for name in ("observations", *needs)}
         if "lstm_states" in needs:
             hidden, cell = sample.lstm_states.pi if of_policy else sample.lstm_states.vf
