@@ -15,6 +15,8 @@ from stable_baselines3.common.logger import (
     make_output_format,
 )
 
+from sb3_cchain.callbacks.log_folder import log_folder
+
 # By the names that Stable-Baselines3 has for them
 _FORMATS = {CSVOutputFormat: "csv", JSONOutputFormat: "json", TensorBoardOutputFormat: "tensorboard"}
 
@@ -32,8 +34,8 @@ def describe_log(model: BaseAlgorithm) -> dict[str, Any]:
             formats.append(name)
         elif not type(output).__module__.startswith("sb3_cchain."):  # these come by themselves
             others.append(type(output).__name__)
-    has_folder = model._custom_logger or model.tensorboard_log is not None
-    return {"folder": model.logger.dir if has_folder else None, "formats": formats, "others": others}
+    folder = log_folder(model)
+    return {"folder": None if folder is None else str(folder), "formats": formats, "others": others}
 
 
 def further_logger(saved: Mapping[str, Any], num_timesteps: int) -> Logger | None:
