@@ -42,19 +42,19 @@ def last_surrogate(model: PPO) -> Iterator[Callable[[], float]]:
         nonlocal of_update
         of_update = minibatch, log_prob  # what `target_kl` stops is evaluated and not updated on
 
-    def surrogate() -> float:
-        minibatch, log_prob = of_update
-        advantages = minibatch.advantages
-        if model.normalize_advantage and len(advantages) > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        ratio = th.exp(log_prob - minibatch.old_log_prob)
-        clip_range = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
-        clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
-        return -th.min(advantages * ratio, advantages * clipped).mean().item()
-
     with (
         replaced(model.rollout_buffer, "get", watched_get),
         replaced(policy, "evaluate_actions", watched_evaluate_actions),
         extra_gradient(policy.optimizer, remember),
     ):
-        yield surrogate
+        yield lambda: _clipped_surrogate(model, *of_update)
+
+
+def _clipped_surrogate(model: PPO, minibatch: Any, log_prob: th.Tensor) -> float:
+    advantages = minibatch.advantages
+    if model.normalize_advantage and len(advantages) > 1:
+        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    ratio = th.exp(log_prob - minibatch.old_log_prob)
+    clip_range = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
+    clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+    return -th.min(advantages * ratio, advantages * clipped).mean().item()
