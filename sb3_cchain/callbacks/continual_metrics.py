@@ -82,31 +82,12 @@ class ContinualMetrics(BaseCallback):
         self._finished.clear()
         self._endless.clear()
         is_new = self.num_timesteps == 0
-        # Of the task being trained, kept with the model: the rewards and steps so far, and the episodes that ended
-        state = None if is_new else getattr(self.model, "continual_state", None)
-        if state is None:
-            state = {"task_id": None, "n_switches": 0, "reward": 0.0, "n_steps": 0, "n_episodes": 0}
-        if "returns" not in state or not episode_goes_on(self.model):
-            state["returns"] = np.zeros(self.training_env.num_envs)  # of the present episodes so far
-        self._state: dict[str, Any] = state
+        self._state: dict[str, Any] = self._past_state(is_new)
         self.model.continual_state = self._state  # type: ignore[attr-defined]
-        self._switch = TaskSwitch(state["task_id"])
+        self._switch = TaskSwitch(self._state["task_id"])
 
         path = self.path or log_path(self.model, RETURNS_CSV)
-        past = [] if is_new else getattr(self.model, "continual_returns", [])
-        if not past and not is_new and path is not None and path.exists():
-            past = read_returns(path)
-        # Rows of training that was lost after the last save will come again, and so will the row of a task that goes on and
-        # in which no episode has ended yet
-        goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
-        if not goes_on and state["n_episodes"] == 0:
-            state["n_steps"] = 0  # its row is written
-        present = (self.num_timesteps, state["task_id"], 0) if goes_on else None
-        self.rows = [
-            row
-            for row in past
-            if row["timesteps"] <= self.num_timesteps and (row["timesteps"], row["task_id"], row["n_episodes"]) != present
-        ]
+        self.rows: list[dict[str, float]] = [] if is_new else self._past_rows(path)
         self.model.continual_returns = self.rows  # type: ignore[attr-defined]
         self._file = None if path is None else ReturnsFile(path, self.rows, keep_old=is_new)
         self._averages: dict[int, float] = task_averages(self.rows)
@@ -116,6 +97,33 @@ class ContinualMetrics(BaseCallback):
         self._vec_normalize = self.model.get_vec_normalize_env()
         self._rollout_reward, self._rollout_steps = 0.0, 0
         self._is_training = True
+
+    def _past_state(self, is_new: bool) -> dict[str, Any]:
+        """Of the task being trained, kept with the model: the rewards and steps so far, and the episodes that ended."""
+        state = None if is_new else getattr(self.model, "continual_state", None)
+        if state is None:
+            state = {"task_id": None, "n_switches": 0, "reward": 0.0, "n_steps": 0, "n_episodes": 0}
+        if "returns" not in state or not episode_goes_on(self.model):
+            state["returns"] = np.zeros(self.training_env.num_envs)  # of the present episodes so far
+        return state
+
+    def _past_rows(self, path: Path | None) -> list[dict[str, float]]:
+        """Those kept with the model or, where it has none, those of the file."""
+        past = getattr(self.model, "continual_returns", [])
+        if not past and path is not None and path.exists():
+            past = read_returns(path)
+        # Rows of training that was lost after the last save will come again, and so will the row of a task that goes on and
+        # in which no episode has ended yet
+        state = self._state
+        goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
+        if not goes_on and state["n_episodes"] == 0:
+            state["n_steps"] = 0  # its row is written
+        present = (self.num_timesteps, state["task_id"], 0) if goes_on else None
+        return [
+            row
+            for row in past
+            if row["timesteps"] <= self.num_timesteps and (row["timesteps"], row["task_id"], row["n_episodes"]) != present
+        ]
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], self.locals["dones"]
