@@ -188,22 +188,17 @@ def make_coefficient(
     :return: The coefficient
     :raises ValueError: Naming the argument, when it cannot be read or lies outside its range
     """
-    adaptive = AdaptiveChurnCoefficient(
-        (
-            default_target_ratio
-            if target_ratio == "auto"
-            else _number("target_churn_ratio", target_ratio, target_ratio, ' or "auto"')
-        ),
-        warmup=warmup,
-        window=window,
-        minimum=minimum,
-    )
-    if isinstance(churn_coef, str) and churn_coef.startswith("auto"):
-        if churn_coef != "auto":
-            adaptive.initial = _number("churn_coef", churn_coef, churn_coef.removeprefix("auto_"), _CHURN_COEF)
-            _check_factor("churn_coef", adaptive.initial)
-        return adaptive
-    return ChurnCoefficient(_number("churn_coef", churn_coef, churn_coef, _CHURN_COEF))
+    is_adaptive = isinstance(churn_coef, str) and churn_coef.startswith("auto")
+    initial = 1.0
+    if churn_coef != "auto":
+        number = str(churn_coef).removeprefix("auto_") if is_adaptive else churn_coef
+        initial = _number("churn_coef", churn_coef, number, _CHURN_COEF)
+    if target_ratio == "auto":
+        target_ratio = default_target_ratio
+    ratio = _number("target_churn_ratio", target_ratio, target_ratio, ' or "auto"')
+    # Made for a fixed λ, too, so that all arguments are checked
+    adaptive = AdaptiveChurnCoefficient(ratio, initial, warmup, window, minimum)
+    return adaptive if is_adaptive else ChurnCoefficient(initial)
 
 
 _CHURN_COEF = ', "auto", or "auto_" followed by the value during warm-up, as in "auto_10"'
