@@ -76,7 +76,8 @@ def told_task(model: BaseAlgorithm) -> Any:
     signal = active_signal(model.env)
     if signal is not None:
         return signal.next_task
-    return first_reset_info(model.env).get(TASK_KEY, getattr(model, "task_count", None) or None)
+    n_switches = getattr(model, "task_count", 0)
+    return first_reset_info(model.env).get(TASK_KEY, n_switches if n_switches > 0 else None)
 
 
 def _known_task(model: BaseAlgorithm, info: dict[str, Any]) -> Any:
