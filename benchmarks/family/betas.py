@@ -25,7 +25,7 @@ def _variants(base: type[BaseAlgorithm], cchain: type[BaseAlgorithm], **betas: s
     for target, values in betas.items():
         defaults = churn_kind(base).targets[target].target_ratios.values()
         for beta in values.split():
-            label = f"{target}, β {beta}{' (default)' * (float(beta) in defaults)}"
+            label = f"{target}, β {beta}{' (default)' if float(beta) in defaults else ''}"
             arguments = {"churn_target": target, "target_churn_ratio": float(beta)}
             variants[f"cchain_{target}_{beta}"] = Variant(label, cchain, arguments)
     return variants

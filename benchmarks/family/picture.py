@@ -33,9 +33,8 @@ def plot(case: Case, evaluations: Evaluations, path: Path) -> None:
         if name != base and evaluations[base]:
             label = f"{case.variants[base].label}, mean"
             panel.plot(*_mean(list(evaluations[base].values())).T, color="black", linestyle="--", linewidth=1, label=label)
-        panel.plot(
-            *_mean(seeds).T, color=colors[name], linewidth=2, label=f"mean of {len(seeds)} seed{'s' * (len(seeds) > 1)}"
-        )
+        label = f"mean of {len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+        panel.plot(*_mean(seeds).T, color=colors[name], linewidth=2, label=label)
         for task in range(1, case.n_tasks):
             panel.axvline(task * case.steps / case.n_tasks, color="black", linewidth=0.6, linestyle=":")
         if case.solved is not None:

@@ -126,7 +126,7 @@ class View:
             self.waiting.insert(0, failure.run)
         else:
             self.failures.append(failure)
-        words = f"{failure}{' (tried again)' * again}"
+        words = f"{failure}{' (tried again)' if again else ''}"
         self.console.print(f"[red]{escape(words)}[/red]", soft_wrap=True, highlight=False)
 
     def _seconds(self, run: Run) -> float:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -111,7 +112,7 @@ def ppo_parts(n_rounds: int = 12, **changed: Any) -> Table:
     }
     for model in models.values():
         model.learn(2 * model.n_steps)
-    n_updates = model.n_epochs * -(-model.n_steps * model.n_envs // model.batch_size)
+    n_updates = model.n_epochs * ceil(model.n_steps * model.n_envs / model.batch_size)
     return parts_table(models, lambda model: model.train(), n_updates, n_rounds)
 
 

@@ -103,7 +103,7 @@ def results_table(problem_name: str, results: Results) -> str:
 def _made_with(results: Results) -> str:
     settings = [result.about["settings"] for seeds in results.values() for result in seeds.values()]
     lengths = dict.fromkeys(
-        f"{each['images']} images, {each['epochs']} epoch{'s' * (each['epochs'] > 1)}" for each in settings
+        f"{each['images']} images, {each['epochs']} epoch{'s' if each['epochs'] > 1 else ''}" for each in settings
     )
     sources = dict.fromkeys(each["data"] for each in settings)
     speeds = "; ".join(

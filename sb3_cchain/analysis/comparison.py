@@ -112,10 +112,11 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
         curves = {label: [_curves(rows, window, mixed) for rows in runs] for label, runs in methods.items()}
         for number, (label, runs) in enumerate(curves.items()):
             color, style = f"C{number}", LINE_STYLES[number % len(LINE_STYLES)]
-            name: str | None = f"{label}, {len(runs)} run{'s' * (len(runs) > 1)}"
+            name: str | None = f"{label}, {len(runs)} run{'s' if len(runs) > 1 else ''}"
             for curves_in_task in zip(*runs, strict=False):  # as many tasks as all runs have reached
                 grid, mean, low, high = band(curves_in_task)
-                axes.plot(grid, mean, color=color, linestyle=style, linewidth=1.8, marker="o" * (len(grid) == 1), label=name)
+                marker = "o" if len(grid) == 1 else None
+                axes.plot(grid, mean, color=color, linestyle=style, linewidth=1.8, marker=marker, label=name)
                 axes.fill_between(grid, low, high, color=color, alpha=0.2, linewidth=0)
                 name = None  # once in the legend
         longest = max((run for runs in curves.values() for run in runs), key=len)

@@ -1,5 +1,6 @@
 """Looks at a model after its training: churn, the neural tangent kernel, the health of its networks, and what is wrong."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -129,7 +130,7 @@ def _one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, 
         n_steps = model.n_steps * model.n_envs
     else:
         settings["learning_starts"] = model.num_timesteps  # the rollout that fills the buffer has no random actions
-        settings["train_freq"] = TrainFreq(-(-n_steps // model.n_envs), TrainFrequencyUnit.STEP)
+        settings["train_freq"] = TrainFreq(math.ceil(n_steps / model.n_envs), TrainFrequencyUnit.STEP)
         settings["gradient_steps"] = n_updates
     # All episodes of this rollout, and no others
     settings |= {"ep_info_buffer": None, "ep_success_buffer": None, "_stats_window_size": n_steps}
@@ -197,7 +198,7 @@ def _roll_out(model: BaseAlgorithm, n_steps: int) -> tuple[Symptoms, dict[str, f
     env = model.env
     assert env is not None
     observations, episodes, seen = env.reset(), [], []
-    for _ in range(-(-n_steps // env.num_envs)):
+    for _ in range(math.ceil(n_steps / env.num_envs)):
         seen.append(np.array(observations))
         actions, _ = model.predict(observations)  # type: ignore[arg-type]
         observations, _, _, infos = env.step(actions)
