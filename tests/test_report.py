@@ -799,6 +799,14 @@ def test_what_is_logged_a_rollout_later_counts_where_it_was_made(tmp_path):
     assert RETURNS.series(result, 1)[1].tolist() == [0, 1]
 
 
+def test_both_tasks_in_one_rollout(tmp_path):
+    write(tmp_path, "cchain", [[0], [1]], metrics=[(20, "churn/coef", 20)])
+    (result,) = whole_results(tmp_path)
+    for row in result.returns:
+        row["timesteps"] = 200
+    assert Quantity("churn/coef", "", delay=1).series(result, 0)[1].tolist() == [20]
+
+
 FRAME = np.zeros((20, 30, 3), np.uint8)
 
 

@@ -132,9 +132,9 @@ class Result(Run):
             beyond the end of the last task counts for the last task
         """
         logged = np.array(self.metrics.get(name, [])).reshape(-1, 2)
-        if delay and len(self.returns) > 1:
-            rollout = min(set(np.diff([row["timesteps"] for row in self.returns])) - {0})
-            logged[:, 0] -= delay * rollout
+        ends = np.unique([row["timesteps"] for row in self.returns])  # a rollout may have a row for each of two tasks
+        if delay and len(ends) > 1:
+            logged[:, 0] -= delay * np.diff(ends).min()
         chosen = logged[np.searchsorted(self.task_boundaries[:-1], logged[:, 0]) == task]
         return chosen[:, 0], chosen[:, 1]
 
