@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ChurnMonitor, ContinualMetrics, DoubleDQN, transfer
 from sb3_cchain.analysis import NetworkHealth
-from sb3_cchain.methods import TRAC, Oracle
+from sb3_cchain.methods import TRAC, ContinualBackprop, Oracle
 from sb3_cchain.networks import InjectionPolicy, LayerNormPolicy
 from tests.envs import RandomEnv
 
@@ -193,6 +193,17 @@ def test_churn_is_monitored_on_observations_of_the_new_environment(algorithm):
     transfer(model, gym.make("Acrobot-v1"))
     model.learn(32, callback=ChurnMonitor(interval=1, batch_size=8), reset_num_timesteps=False)
     assert model.churn_monitor_batch["observations"].shape == (8, 6)
+
+
+def test_units_that_are_new_have_not_been_used():
+    model, recycling = trained(PPO), ContinualBackprop()
+    model.learn(32, callback=recycling, reset_num_timesteps=False)
+    former = recycling._usefulness
+    model.learn(32, callback=recycling, reset_num_timesteps=False)
+    assert recycling._usefulness is former
+    transfer(model, gym.make("Acrobot-v1"))
+    model.learn(32, callback=recycling, reset_num_timesteps=False)
+    assert recycling._usefulness is not former
 
 
 def test_normalised_and_several_environments():

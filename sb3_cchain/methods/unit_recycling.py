@@ -51,13 +51,13 @@ class UnitRecycling(BaseCallback):
             raise ValueError(
                 f"{type(self).__name__} finds no hidden unit that is trained and has outgoing weights of its own in {policy}"
             )
-        begun_with = (self.model, [layer.layer for layer in self._layers])
+        begun_with = (policy, [layer.layer for layer in self._layers])
         if getattr(self, "_begun_with", None) != begun_with:
             self._begun_with = begun_with
             self._begin()
 
     def _begin(self) -> None:
-        """Called when training starts, but not again when the same callback goes on with the same layers of the same model."""
+        """Called when training starts, but not again when the same callback goes on with the same layers of the same policy."""
 
     def _find_layers(self, policy: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
         return find_hidden_units(policy, run)
