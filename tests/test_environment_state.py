@@ -1,7 +1,9 @@
 """The state of environments is put back into new ones, which go on as the old ones would have."""
 
+import math
 import pickle
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -565,6 +567,46 @@ def test_replay_needs_no_episode():
     env, new = EpisodeReplay(Opaque()), EpisodeReplay(Opaque())
     new.load_state_dict(env.state_dict())
     assert new.is_recorded
+
+
+class Levels(RandomEnv):
+    """Takes the next level, its map and its rule at each reset."""
+
+    levels = ((CountEnv, Path("maps/a"), math.sin), (RandomEnv, Path("maps/b"), math.cos))
+    n_resets = 0
+
+    def reset(self, **kwargs):
+        self.kind, self.map, self.rule = self.levels[self.n_resets % 2]
+        self.n_resets += 1
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, self.rule(ord(self.map.name) + len(self.kind.__name__)), *rest
+
+
+def test_what_an_environment_takes_another_of():
+    env, new = (begin(DummyVecEnv([Levels])) for _ in range(2))
+    check_cuts(env, new, (3, 13, 20), 40)
+    assert "EpisodeReplay" not in str(env.envs[0])
+
+
+class Reader(RandomEnv):
+    """Observes the lines of a file."""
+
+    def reset(self, **kwargs):
+        self.file = open(__file__)
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(len(next(self.file))), *rest
+
+
+def test_an_environment_that_reads_a_file_is_played_again():
+    env, new = (begin(DummyVecEnv([Reader])) for _ in range(2))
+    assert "EpisodeReplay" in str(env.envs[0])
+    check_cuts(env, new, (3, 13, 20), 40)
 
 
 class World:

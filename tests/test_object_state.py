@@ -1,11 +1,13 @@
 """The state of objects is put back into objects that were made in the same way."""
 
 import io
+import math
 import pickle
 import random
 import sys
 import threading
 from collections import OrderedDict, defaultdict, deque
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
@@ -183,9 +185,37 @@ def test_behaviours():
     source.now, source.then, source.made = source.run, walk, lambda: 1
     live.now, live.then, live.made = live.rest, len, (made := lambda: 2)
     restore_object(live, saved(source, strict=True))
-    assert live.now == live.run and live.made is made
-    # A function of another kind is not replaced
-    assert live.then is len
+    assert live.now == live.run and live.then is walk and live.made is made
+
+
+# What an environment may take from one thing to another of, such as the map of a level and its rules
+NAMED = {
+    "function": walk,
+    "builtin function": math.sin,
+    "function of PyTorch": th.sin,
+    "method of a class": dict.fromkeys,
+    "class": Animal,
+    "path": Path("maps/b"),
+    "pure path": PurePosixPath("b"),
+    "none": None,
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_what_has_a_name_is_put_back_where_all_has_to_be(name):
+    named = NAMED[name]
+    states = saved(Thing(it=named, inner=Thing(it=named)), strict=True)
+    for there in (len, World, Path("maps/a"), None):
+        live = Thing(it=there, inner=Thing(it=there))
+        restore_object(live, states)
+        assert live.it == live.inner.it == named and type(live.it) is type(named)
+
+
+def test_the_method_of_a_generator_is_that_of_the_generator_here():
+    source, live = (Thing(rng=np.random.default_rng(seed)) for seed in range(2))
+    source.draw, live.draw = source.rng.normal, live.rng.random
+    restore_object(live, saved(source, strict=True))
+    assert live.draw == live.rng.normal and live.draw() == source.draw()
 
 
 def test_a_method_that_was_replaced_is_not_mistaken_for_its_replacement():
@@ -395,13 +425,33 @@ def test_what_cannot_be_saved_is_named():
     assert left_out == ["env.inner.lock"] and vars(live["env"].inner) == {"lock": "mine", "number": 1}
 
 
-def test_what_belongs_to_the_process_stays(tmp_path):
-    file = open(tmp_path / "file", "w")
-    source = Thing(file=file, path=tmp_path, function=lambda: 1, kind=int, module=sys, stream=io.StringIO())
-    live = Thing(file="mine", path="mine", function="mine", kind="mine", module="mine", stream="mine")
-    restore_object(live, saved(source, strict=True))
-    assert set(vars(live).values()) == {"mine"}
-    file.close()
+@pytest.mark.parametrize("strict", [False, True])
+def test_what_belongs_to_the_process_stays(tmp_path, strict):
+    with open(tmp_path / "closed", "w") as closed, open(tmp_path / "written", "w") as written:
+        closed.close()
+        attributes = dict(closed=closed, written=written, function=lambda: 1, local=type("Local", (), {}), module=sys)
+        if not strict:
+            attributes |= dict(path=tmp_path, kind=int, stream=io.StringIO(), named=walk)
+        live = Thing(**dict.fromkeys(attributes, "mine"))
+        restore_object(live, saved(Thing(**attributes), strict=strict))
+        assert set(vars(live).values()) == {"mine"}
+
+
+@pytest.mark.parametrize("mode", ["r", "rb", "r+"])
+def test_a_file_that_is_read_cannot_be_saved(tmp_path, mode):
+    (tmp_path / "numbers").write_text("1\n2\n")
+    with open(tmp_path / "numbers", mode) as file, pytest.raises(NotSaved, match=r"^env\.inner\.file: cannot pickle"):
+        object_states({"env": Thing(inner=Thing(file=file))}, strict=["env"])
+
+
+@pytest.mark.parametrize("kind, content", [(io.StringIO, "1\n2\n"), (io.BytesIO, b"1\n2\n")])
+def test_a_file_in_memory_goes_on_where_it_was(kind, content):
+    live = Thing(file=kind(content))
+    next(live.file)
+    state = saved(live, strict=True)
+    expected = next(live.file)
+    restore_object(live, state)
+    assert next(live.file) == expected
 
 
 def test_a_path_of_this_process_stays(tmp_path):

@@ -2,9 +2,9 @@
 The state of objects: what their attributes hold, to be put back into objects made in the same way in another process.
 
 Objects, lists, dicts and sets that attributes refer to stay the objects that they are, and only their content is put back. So
-whoever else refers to them, such as hooks and closures, refers to the right one afterwards, and what cannot be saved, such as
-an open file, is that of the new process. All contents are pickled at once, so that what several of them refer to is still one
-object afterwards.
+whoever else refers to them, such as hooks and closures, refers to the right one afterwards, and what belongs to the process,
+such as a window, is that of the new process. All contents are pickled at once, so that what several of them refer to is still
+one object afterwards.
 
 An object that knows better what its state is has the methods ``state_dict()`` and ``load_state_dict(state)``, as PyTorch's
 modules and optimisers have. Its attributes are not looked at then.
@@ -31,8 +31,10 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import ResultsWriter
 
-# They belong to the process: code, files and their places, and how something was made
-KEPT = (FunctionType, MethodType, BuiltinFunctionType, type, ModuleType, property, io.IOBase, PurePath, EnvSpec, ResultsWriter)
+# They belong to the process: how something was made, and what writes files
+KEPT = (ModuleType, property, EnvSpec, ResultsWriter)
+# Saved by their names
+CODE = (FunctionType, MethodType, BuiltinFunctionType, type)
 # They are copied as a whole
 DATA = (Number, np.generic, np.ndarray, th.Tensor, str, bytes, dict, list, tuple, set, frozenset, Enum)
 
@@ -55,12 +57,14 @@ class Entry(NamedTuple):
     :param name: Name of the attribute, or of the holder
     :param kind: Name of its class, by which it is made where it is not there; None where it cannot be made
     :param is_needed: Whether it has to be there to take its state
+    :param is_whole: Whether its state is all that it refers to
     """
 
     owner: int | None
     name: str
     kind: str | None
     is_needed: bool = False
+    is_whole: bool = False
 
 
 class ObjectStates(NamedTuple):
@@ -132,8 +136,9 @@ def object_states(
     :param holders: Objects by names. What several of them refer to is still one object when their states are put back
     :param known: Objects whose state is kept elsewhere, by names that mean the same ones when the states are put back
     :param skip: For each holder the names of its attributes that are not part of its state
-    :param strict: Names of the holders whose state is all that they refer to. That of the others is plain data, tensors, and
-        objects whose class comes from this package, or from a package of the holder's class or of its bases
+    :param strict: Names of the holders whose state is all that they refer to, with code, as far as it can be found by its
+        name. That of the others is plain data, tensors, and objects whose class comes from this package, or from a package of
+        the holder's class or of its bases
     :param left_out: Takes the names of what is not part of the states of the others, as ``holder.attribute.attribute``
     :return: The state of each
     :raises NotSaved: For an attribute of a ``strict`` holder that cannot be saved
@@ -176,7 +181,7 @@ def restore_objects(holders: Mapping[str, object], states: ObjectStates, known: 
             except ValueError as error:
                 raise ValueError(f"{entry.name}: {error}") from error
         elif entry.owner is None or entry.kind is not None:  # not an object that this process does without, such as a file
-            _fill(value, content)
+            _fill(value, content, entry.is_whole)
 
 
 def _replace(old: Any, new: Any) -> None:
@@ -191,10 +196,9 @@ def _make(kind: Any) -> Any:
     return kind() if issubclass(kind, np.random.RandomState | random.Random) else kind.__new__(kind)
 
 
-def _fill(value: Any, attributes: Mapping[str, Any]) -> None:
+def _fill(value: Any, attributes: Mapping[str, Any], is_whole: bool) -> None:
     for name, new in attributes.items():
-        old = vars(value).get(name)
-        if not _is_kept(old) or (_is_code(old) and _is_code(new)):
+        if not _is_kept(vars(value).get(name), is_whole):
             vars(value)[name] = new
 
 
@@ -208,11 +212,10 @@ class _Reader:
         # How data refers to an object: by the name of a known one, or the number of an entry
         self._references: dict[int, str | int] = {id(value): name for name, value in known.items()}
         self._references.update({id(holder): number for number, holder in enumerate(holders.values())})
-        self.entries = [Entry(None, name, None) for name in holders]
-        # Of each entry: its attributes or own state, the way to it, and whether all of it has to be saved
+        self.entries = [Entry(None, name, None, is_whole=name in strict) for name in holders]
+        # Of each entry: its attributes or own state, and the way to it
         self._contents: dict[int, Any] = {}
         self._paths = list(holders)
-        self._strict = [name in strict for name in holders]
         self._with_attributes: list[int] = []
         # How many attributes are arrays in the same memory, by the id of the array that it belongs to
         self._n_arrays: Counter[int] = Counter()
@@ -237,8 +240,9 @@ class _Reader:
 
     def _is_saved(self, owner: int, name: str, value: Any) -> bool:
         """Whether an attribute is part of the state. An object that is met for the first time is read, too."""
-        if _is_kept(value):
-            return self._strict[owner] and _is_code(value)
+        is_whole = self.entries[owner].is_whole
+        if _is_kept(value, is_whole):
+            return False
         if id(value) in self._references:
             return True
         own = _own_state(value)
@@ -248,21 +252,20 @@ class _Reader:
             self._enter(owner, name, value, _kind_name(value))
         elif isinstance(value, np.ndarray):
             self._n_arrays[id(_owner(value))] += 1
-        elif not self._strict[owner] and not _is_data(value):
+        elif not is_whole and not _is_data(value):
             self._left_out.append(self._path(owner, name))
             return False
         return True
 
     def _is_of_state(self, owner: int, value: object) -> bool:
-        return self._strict[owner] or _package(type(value)) in self._packages
+        return self.entries[owner].is_whole or _package(type(value)) in self._packages
 
     def _enter(self, owner: int, name: str, value: object, kind: str | None) -> None:
         number = self._references[id(value)] = len(self.entries)
         # This package's own, such as an open file of returns, are there where they are needed
         is_needed = has_state_dict(type(value)) and _package(type(value)) != "sb3_cchain"
-        self.entries.append(Entry(owner, name, kind, is_needed))
+        self.entries.append(Entry(owner, name, kind, is_needed, self.entries[owner].is_whole))
         self._paths.append(self._path(owner, name))
-        self._strict.append(self._strict[owner])
         self._read(number, value)
 
     def _path(self, owner: int, name: str) -> str:
@@ -270,7 +273,7 @@ class _Reader:
 
     def pickled(self) -> bytes:
         """All contents. What they refer to has to be there until then."""
-        self._filter(lambda number, name, value: not _is_code(value) or self._can_refer_to(value))
+        self._filter(lambda number, name, value: not isinstance(value, CODE) or self._can_refer_to(value))
         try:
             return self._pickle(self._contents)
         except Exception:  # whatever the code of an object raises
@@ -287,11 +290,14 @@ class _Reader:
             self._contents[number] = {name: value for name, value in content.items() if is_kept(number, name, value)}
 
     def _can_refer_to(self, code: Any) -> bool:
-        if isinstance(code, MethodType):
-            return id(code.__self__) in self._references and getattr(code.__self__, code.__name__, None) == code
+        owner = getattr(code, "__self__", None)
+        if owner is not None and not isinstance(owner, ModuleType):  # a method
+            is_found = isinstance(owner, type) or id(owner) in self._references
+            return is_found and getattr(owner, code.__name__, None) == code
         try:
-            return find_named(name_in_module(code)) is code
-        except (AttributeError, ImportError):  # made by other code
+            self._pickle(code)
+            return True
+        except (AttributeError, pickle.PicklingError):  # made by other code
             return False
 
     def _can_pickle(self, number: int, value: Any, path: str) -> bool:
@@ -299,7 +305,7 @@ class _Reader:
             self._pickle(value)
             return True
         except Exception as error:
-            if self._strict[number]:
+            if self.entries[number].is_whole:
                 raise NotSaved(f"{path}: {error}") from error
             self._left_out.append(path)
             return False
@@ -397,15 +403,17 @@ def _transposed(array: NDArray[Any]) -> Any:
 
 
 def _is_data(value: object) -> bool:
-    return isinstance(value, DATA) or not hasattr(value, "__dict__")
+    return isinstance(value, (*DATA, *CODE, io.IOBase)) or not hasattr(value, "__dict__")
 
 
-def _is_kept(value: object) -> bool:
+def _is_kept(value: object, is_whole: bool) -> bool:
+    """Whether an attribute stays that of the process, as it was made there."""
+    if isinstance(value, io.IOBase):
+        # Nothing comes back from a file that is only written
+        return not is_whole or value.closed or not value.readable()
+    if isinstance(value, (*CODE, PurePath)):
+        return not is_whole
     return isinstance(value, KEPT) or _package(type(value)) in DISPLAYS
-
-
-def _is_code(value: object) -> bool:
-    return isinstance(value, FunctionType | MethodType)
 
 
 def _own_state(value: Any) -> _OwnState | None:
