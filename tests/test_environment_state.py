@@ -375,6 +375,25 @@ class Bonus(Opaque):
         return observation, self.bonus, *rest
 
 
+class Lasting(RandomEnv):
+    """Goes on with a generator or a file where the episode before stopped."""
+
+    def __init__(self, stream):
+        super().__init__()
+        self.stream = stream
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(len(next(self.stream))), *rest
+
+
+@pytest.mark.parametrize("make", [lambda: (str(n) for n in range(100)), lambda: open(__file__)], ids=["generator", "file"])
+def test_episodes_that_go_on_with_a_stream_are_warned_of(make):
+    env = DummyVecEnv([lambda: Lasting(make())])
+    with pytest.warns(UserWarning, match=r"Lasting.* holds stream, a generator or a file, .* training cannot be resumed"):
+        prepare_environment(env)
+
+
 class GlobalNumbers(RandomEnv):
     """Draws from NumPy's global generator."""
 
@@ -603,6 +622,7 @@ class Reader(RandomEnv):
         return observation, float(len(next(self.file))), *rest
 
 
+@pytest.mark.filterwarnings("ignore:.*holds file, a generator or a file")
 def test_an_environment_that_reads_a_file_is_played_again():
     env, new = (begin(DummyVecEnv([Reader])) for _ in range(2))
     assert "EpisodeReplay" in str(env.envs[0])

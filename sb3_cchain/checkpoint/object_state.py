@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Mapping
 from enum import Enum
 from numbers import Number
 from pathlib import PurePath
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, FunctionType, GeneratorType, MethodType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -409,11 +409,20 @@ def _is_data(value: object) -> bool:
 def _is_kept(value: object, is_whole: bool) -> bool:
     """Whether an attribute stays that of the process, as it was made there."""
     if isinstance(value, io.IOBase):
-        # Nothing comes back from a file that is only written
-        return not is_whole or value.closed or not value.readable()
+        return not is_whole or not is_stream(value)
     if isinstance(value, (*CODE, PurePath)):
         return not is_whole
     return isinstance(value, KEPT) or _package(type(value)) in DISPLAYS
+
+
+def is_stream(value: object) -> bool:
+    """
+    :param value: Any
+    :return: Whether it is a generator, or a file that is read. Nothing comes back from one that is only written
+    """
+    if isinstance(value, io.IOBase):
+        return not value.closed and value.readable()
+    return isinstance(value, GeneratorType)
 
 
 def _own_state(value: Any) -> _OwnState | None:

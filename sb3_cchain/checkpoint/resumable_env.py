@@ -1,5 +1,6 @@
 """The state of a single environment with its wrappers."""
 
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +12,14 @@ from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.object_state import NotSaved, ObjectStates, object_states, restore_objects, stock_class
+from sb3_cchain.checkpoint.object_state import (
+    NotSaved,
+    ObjectStates,
+    is_stream,
+    object_states,
+    restore_objects,
+    stock_class,
+)
 from sb3_cchain.checkpoint.random_state import random_state, restore_random_state
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
 from sb3_cchain.checkpoint.words import in_words
@@ -153,6 +161,12 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
             raise ValueError(
                 f"{layer} cannot be resumed, because its state cannot be saved: {fault}. "
                 "Give its class `state_dict()` and `load_state_dict(state)`"
+            )
+        if streams := [name for name, value in vars(layer).items() if is_stream(value)]:
+            warnings.warn(
+                f"{layer} holds {', '.join(streams)}, a generator or a file, whose place cannot be saved. If an episode goes "
+                "on there where the one before stopped, training cannot be resumed. Let `reset()` make it anew, give the class "
+                "`state_dict()` and `load_state_dict(state)`, or use TrainingCheckpoint(..., exact=False)"
             )
         replay: gym.Env = EpisodeReplay(layer, begun=begun and _may_have_begun(chain))
         if position == 0:

@@ -57,7 +57,7 @@ class UnitRecycling(BaseCallback):
             self._begin()
 
     def _begin(self) -> None:
-        """Called when training starts, but not again when the same callback goes on with the same layers of the same policy."""
+        """Called when training starts, but not again when the callback goes on with the same layers of the same policy."""
 
     def _find_layers(self, policy: nn.Module, run: Callable[[], Any]) -> list[HiddenUnits]:
         return find_hidden_units(policy, run)
