@@ -165,8 +165,8 @@ def make_resumable(env: gym.Env, *, begun: bool = True) -> gym.Env:
         if streams := [name for name, value in vars(layer).items() if is_stream(value)]:
             warnings.warn(
                 f"{layer} holds {', '.join(streams)}, a generator or a file, whose place cannot be saved. If an episode goes "
-                "on there where the one before stopped, training cannot be resumed. Let `reset()` make it anew, give the class "
-                "`state_dict()` and `load_state_dict(state)`, or use TrainingCheckpoint(..., exact=False)"
+                "on there where the one before stopped, training cannot be resumed. Let `reset()` make it anew, give the "
+                "class `state_dict()` and `load_state_dict(state)`, or use TrainingCheckpoint(..., exact=False)"
             )
         replay: gym.Env = EpisodeReplay(layer, begun=begun and _may_have_begun(chain))
         if position == 0:
