@@ -91,7 +91,7 @@ NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
 singular values that hold 99 % of their sum; the sums are those of the absolute values off and on the diagonal. In the table,
 means over the logs of a task and over the seeds. In the pictures, the mean over the seeds (of the logarithms, for the sums)
-with a band of ± one standard error."""
+with a band of ± one standard error, or a thin line for each of fewer than four seeds."""
 
 
 def write_report(results: Sequence[Result], experiment: str, folder: Path, left_out: Sequence[str] = ()) -> list[str]:
@@ -269,8 +269,9 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, picture
     smooth = f", a running mean over {window} rollouts within a task," if window > 1 else ""
     parts = [
         "### Learning curves",
-        f"The mean{smooth} over all seeds of each method, with a band of ± one standard error; a single seed has no band. "
-        "The methods that the paper compares come first, then the others, a few at a time beside the base algorithm. "
+        f"The mean{smooth} over all seeds of each method, with a band of ± one standard error, or a thin line for each of "
+        "fewer than four seeds. The methods that the paper compares come first, then the others, a few at a time beside the "
+        "base algorithm. "
         "Dashed: the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
     ]
     for env_id, runs in _by_env(results, paper).items():

@@ -1,4 +1,4 @@
-"""All pictures: for each method or variant the mean over its seeds, with a band of its standard error."""
+"""All pictures: for each method or variant the mean over its seeds, with its standard error or, of few seeds, all of them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,6 +20,9 @@ from sb3_cchain.analysis.curves import band, smoothed
 from sb3_cchain.methods.registry import Method
 
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
+
+# Of fewer seeds each has a thin line: a band around the mean of one that learns and one that collapses shows neither
+BAND_SEEDS = 4
 
 
 def plot_learning_curves(
@@ -155,7 +158,7 @@ def _new_figure(width: float, height: float) -> Any:
 def _draw(
     panels: Sequence[Any], results: Sequence[Result], lines: Mapping[str, Method], quantity: Quantity, window: int
 ) -> None:
-    """Each task in its panel: a line and a band for each method that has values there, and the switches."""
+    """Each task in its panel: for each method that has values there the mean, a band or its seeds, and the switches."""
     boundaries = results[0].task_boundaries
     for task, panel in enumerate(panels):
         for name, line in lines.items():
@@ -166,7 +169,11 @@ def _draw(
             grid, mean, low, high = band(curves, quantity.logarithmic)
             marker = "o" if len(grid) == 1 else None
             panel.plot(grid, mean, color=line.color, linewidth=1.8, marker=marker, label=line.label)
-            panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
+            if len(curves) >= BAND_SEEDS:
+                panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
+            elif len(curves) > 1:
+                for steps, values in curves:
+                    panel.plot(steps, values, color=line.color, linewidth=0.8, alpha=0.5)
         if task > 0 and panel is panels[task - 1]:
             panel.axvline(boundaries[task - 1], **SWITCH_STYLE)
         panel.set_xlim(boundaries[task - 1] if task and panel is not panels[0] else 0, boundaries[task])
