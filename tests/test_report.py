@@ -805,6 +805,9 @@ def test_both_tasks_in_one_rollout(tmp_path):
     for row in result.returns:
         row["timesteps"] = 200
     assert Quantity("churn/coef", "", delay=1).series(result, 0)[1].tolist() == [20]
+    # A rollout before: what was logged at 20 was made at 120 - 200 and no earlier rollout
+    result.returns.insert(0, {**result.returns[0], "timesteps": 100})
+    assert Quantity("churn/coef", "", delay=1).series(result, 0)[0].tolist() == [-80]
 
 
 FRAME = np.zeros((20, 30, 3), np.uint8)

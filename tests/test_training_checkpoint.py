@@ -444,6 +444,13 @@ def test_a_copy_beside_the_checkpoints_is_left_alone(path, name):
     assert find_checkpoint(path).num_timesteps == 128
 
 
+def test_a_copy_keeps_its_pieces(dqn_path):
+    copy = Path(shutil.copytree(min(dqn_path.glob("step_*")), dqn_path / "step_best"))
+    resume(dqn_path, make_env(), [TrainingCheckpoint(16, dqn_path, keep=1), Stop(float("inf"))], device="cpu")
+    assert len(names(dqn_path)) == 2
+    assert find_checkpoint(copy).num_timesteps < find_checkpoint(dqn_path).num_timesteps
+
+
 def test_numbers_of_numpy(tmp_path):
     callback = TrainingCheckpoint(np.int64(32), tmp_path, keep=np.int32(2), exact=True)
     make().learn(np.int64(STEPS), callback, log_interval=np.int64(1), tb_log_name=Path("PPO"))
@@ -1115,9 +1122,10 @@ def test_a_second_signal_that_is_not_heeded(tmp_path, handlers):
 
 
 def test_a_second_sigterm_changes_nothing(tmp_path, handlers):
+    heard, _ = handlers
     with pytest.raises(SystemExit):
         make().learn(STEPS, [TrainingCheckpoint(10**6, tmp_path), Send((70, signal.SIGTERM), (71, signal.SIGTERM))])
-    assert names(tmp_path) == [f"step_{80:012d}"]
+    assert names(tmp_path) == [f"step_{80:012d}"] and heard == []
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path, handlers):

@@ -278,9 +278,13 @@ def test_a_log_folder_that_was_moved(tmp_path, at_step):
     assert origin_of(run_folder(tmp_path / "new", 4)) == saved
 
 
-def test_a_run_that_another_process_trains(checkpoints, tmp_path, monkeypatch):
+@pytest.mark.parametrize("has_checkpoint", [True, False])
+def test_a_run_that_another_process_trains(checkpoints, tmp_path, monkeypatch, has_checkpoint):
     run = tmp_path / "logs" / "ppo_cchain" / f"{NAME}_1"
-    shutil.copytree(checkpoints, run)
+    if has_checkpoint:
+        shutil.copytree(checkpoints, run)
+    else:
+        (run / "checkpoints").mkdir(parents=True)
     monkeypatch.setattr("fcntl.flock", mock.Mock(side_effect=BlockingIOError))
     with pytest.raises(SystemExit, match=f"--resume last: another process is training in {run}"):
         train(tmp_path, "--checkpoint-freq", 32, "--resume", "last", n=160, evaluation=NO_EVALUATION)

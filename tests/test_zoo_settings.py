@@ -68,7 +68,7 @@ def test_quickstart_has_the_shipped_settings_in_python(tmp_path):
     snippet = re.search(r"```python\n(.*?)```", section, flags=re.DOTALL)[1]
     kwargs = "env_kwargs=dict(n_tasks=2, steps_per_task=800)"
     shorter = snippet.replace('"Continual/Acrobot-v1", ', f'"Continual/Acrobot-v1", {kwargs}, ').replace("1_600_000", "1600")
-    names = {"CChainPPO": CChainPPO}
+    names = {}
     exec(shorter, names)
     train(tmp_path, "ppo_cchain", "Continual/Acrobot-v1", 1600, "--env-kwargs", "n_tasks:2", "steps_per_task:800")
     (saved,) = tmp_path.rglob("Continual-Acrobot-v1.zip")

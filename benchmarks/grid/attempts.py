@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.grid.run import Run
 from sb3_cchain.checkpoint import write_safely
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, step_folders
 
 # Packages whose versions are recorded
 PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
@@ -76,7 +76,7 @@ class Attempt:
         """
         :return: Its checkpoints, perhaps damaged
         """
-        return [path for path in self.folder.glob(f"{CHECKPOINTS}/step_*") if path.is_dir()]
+        return [path for folder in self.folder.glob(CHECKPOINTS) for path in step_folders(folder)]
 
     def mark_broken(self) -> None:
         """Note that it was ended by an error before anything was trained."""

@@ -48,7 +48,7 @@ def grid_runs(
     suites: Sequence[str],
     env_ids: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
-    seeds: Iterable[int] | None = None,
+    seeds: Sequence[int] | None = None,
     budget: str = "paper",
 ) -> list[Run]:
     """
@@ -97,7 +97,7 @@ def grid_runs(
 def shelf_runs(
     env_ids: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
-    seeds: Iterable[int] | None = None,
+    seeds: Sequence[int] | None = None,
     budget: str = "reduced",
 ) -> list[Run]:
     """

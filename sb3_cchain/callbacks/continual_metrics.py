@@ -105,6 +105,8 @@ class ContinualMetrics(BaseCallback):
             state = {"task_id": None, "n_switches": 0, "reward": 0.0, "n_steps": 0, "n_episodes": 0}
         if "returns" not in state or not episode_goes_on(self.model):
             state["returns"] = np.zeros(self.training_env.num_envs)  # of the present episodes so far
+        if state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) != state["task_id"]:
+            state["n_steps"] = 0  # its row is written
         return state
 
     def _past_rows(self, path: Path | None) -> list[dict[str, float]]:
@@ -114,11 +116,8 @@ class ContinualMetrics(BaseCallback):
             past = read_returns(path)
         # Rows of training that was lost after the last save will come again, and so will the row of a task that goes on and
         # in which no episode has ended yet
-        state = self._state
-        goes_on = state["n_steps"] > 0 and state["n_episodes"] == 0 and episode_task(self.model) == state["task_id"]
-        if not goes_on and state["n_episodes"] == 0:
-            state["n_steps"] = 0  # its row is written
-        present = (self.num_timesteps, state["task_id"], 0) if goes_on else None
+        goes_on = self._state["n_steps"] > 0 and self._state["n_episodes"] == 0
+        present = (self.num_timesteps, self._state["task_id"], 0) if goes_on else None
         return [
             row
             for row in past

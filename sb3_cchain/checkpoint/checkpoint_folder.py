@@ -154,12 +154,12 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_dir():
         reason = "it is a file" if path.exists() else "there is no such folder"
         raise ValueError(f"{path} is not a checkpoint of a training, nor a folder of checkpoints: {reason}")
-    candidates = _step_folders(path)
+    candidates = step_folders(path)
     if not candidates:
         try:
             return Checkpoint(path)
         except ValueError as error:
-            whole = next(filter(None, map(_whole, _step_folders(path.parent))), None)
+            whole = next(filter(None, map(_whole, step_folders(path.parent))), None)
             advice = "" if whole is None else f". The newest whole checkpoint beside it is {whole.path}"
             raise ValueError(f"{error}{advice}") from None
     faults = []
@@ -180,7 +180,7 @@ def has_checkpoint(path: str | Path) -> bool:
     :param path: A folder of checkpoints, which need not exist
     :return: Whether there is a checkpoint in it, whole or not
     """
-    return bool(_step_folders(Path(path)))
+    return bool(step_folders(Path(path)))
 
 
 def is_being_written(path: Path) -> bool:
@@ -190,10 +190,10 @@ def is_being_written(path: Path) -> bool:
     """
     try:
         open_locked(path / LOCK, "").close()
-    except FileNotFoundError:
-        return False
     except ValueError:
         return True
+    except OSError:  # there is no such folder, or nobody may write to it
+        return False
     return False
 
 
@@ -204,8 +204,11 @@ def _whole(path: Path) -> Checkpoint | None:
         return None
 
 
-def _step_folders(folder: Path) -> list[Path]:
-    """The checkpoints in a folder, the newest first. Another name, such as that of a copy, is somebody else's."""
+def step_folders(folder: Path) -> list[Path]:
+    """
+    :param folder: A folder of checkpoints, which need not exist
+    :return: The checkpoints in it, perhaps damaged, the newest first. Another name, such as that of a copy, is somebody else's
+    """
     found = [path for path in folder.glob("step_*") if re.fullmatch(r"step_\d{12,}", path.name)]
     return sorted(found, key=_step, reverse=True)
 
@@ -249,7 +252,7 @@ class CheckpointFolder:
             shutil.rmtree(unfinished)
 
     def _check_newest(self, newest: int | None) -> None:
-        there = _step_folders(self.path)
+        there = step_folders(self.path)
         if newest is None and there:
             raise ValueError(
                 f"`path` holds checkpoints of another training already, the newest of which is {there[0]}. Go on from it by "
@@ -306,13 +309,13 @@ class CheckpointFolder:
     def remove_useless_chunks(self) -> None:
         """Remove the pieces of big arrays that no checkpoint needs, as of one that could not be written."""
         needed: set[str] = set()
-        for folder in _step_folders(self.path):
+        for file in self.path.glob(f"step_*/{INFO}"):  # copies, too
             with suppress(ValueError):  # a damaged one, which is of no use any more
-                needed.update(_read_info(folder)["chunks"])
+                needed.update(_read_info(file.parent)["chunks"])
         self.store.remove_all_but(needed)
 
     def _remove_old(self) -> None:
-        folders = _step_folders(self.path)
+        folders = step_folders(self.path)
         for folder in folders[self.keep :]:
             # By a hidden name first, so that one that is half removed does not pass for a damaged one
             hidden = folder.with_name(f".{folder.name}")
@@ -395,7 +398,7 @@ def _info_text(info: Mapping[str, Any]) -> str:
 
 def _plain(value: Any) -> Any:
     """NumPy's numbers, and paths, that were given as arguments."""
-    return value.item() if isinstance(value, np.generic) else str(value)
+    return value.item() if isinstance(value, np.generic) else os.fspath(value)
 
 
 def _hash(file: Path) -> str:

@@ -52,7 +52,7 @@ class ChunkStore:
         :param names: Names of pieces
         :raises ValueError: When a piece is missing or damaged
         """
-        for name in names:
+        for name in dict.fromkeys(names):  # that of zeros comes often
             self._read(name)
 
     def _read(self, name: str) -> bytes:

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -54,8 +55,8 @@ class TrainingCheckpoint(BaseCallback):
     made, and when the process is told to stop, by Ctrl-C or by SIGTERM, which SLURM sends before a job's time is over. Then it
     ends the training, by ``KeyboardInterrupt`` or, after SIGTERM, by ``SystemExit``. The rollout under way is completed and
     learned from before that. A second Ctrl-C ends the training at once; a second SIGTERM, which schedulers send, changes
-    nothing. In the last rollout, the first signal changes nothing:
-    ``learn()`` is complete then. A further call that goes on with the training stops at its start.
+    nothing. In the last rollout, the first signal changes nothing, either: ``learn()`` is complete then. A further call that
+    goes on with the training stops at its start.
 
     With on-policy algorithms and a ``log_interval`` above 1, it waits for the end of an interval, so that the log goes on in
     the same rhythm. It waits for ``save_freq`` steps at the most, and not at all when it is told to stop.
@@ -219,8 +220,6 @@ class TrainingCheckpoint(BaseCallback):
             try:
                 self._save()
             except OSError as error:
-                assert self._folder is not None
-                self._folder.remove_useless_chunks()
                 warnings.warn(
                     f"No checkpoint was saved at step {self.num_timesteps}: {error}. Training goes on, and the next rollout "
                     "tries again."
@@ -264,7 +263,15 @@ class TrainingCheckpoint(BaseCallback):
 
     def _save(self) -> Path:
         assert self._folder is not None
-        state, left_out = training_state(self._parts, self._folder.store, with_envs=self.exact)
+        try:
+            return self._write(self._folder)
+        except OSError:
+            with suppress(OSError):  # a file system that is gone
+                self._folder.remove_useless_chunks()
+            raise
+
+    def _write(self, folder: CheckpointFolder) -> Path:
+        state, left_out = training_state(self._parts, folder.store, with_envs=self.exact)
         if not self.exact:
             state["lasting"] = {name: lasting_state(env, left_out) for name, env in self._parts.envs.items()}
         info = {
@@ -285,7 +292,7 @@ class TrainingCheckpoint(BaseCallback):
         }
         if self.logger.dir is not None:
             sync_files(Path(self.logger.dir))  # what comes before the checkpoint is not written again
-        path = self._folder.write(info, self.model.save, state)
+        path = folder.write(info, self.model.save, state)
         self._last_saved = self.num_timesteps
         self._note_progress()
         return path

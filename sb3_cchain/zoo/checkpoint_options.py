@@ -138,10 +138,11 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     :raises SystemExit: When there is no whole checkpoint, unless ``last`` is asked for
     """
     if options.resume == LAST:
-        last = find_last_run(arguments)
-        if last is not None and is_being_written(last / CHECKPOINTS):
-            sys.exit(f"--resume last: another process is training in {last}")
-        options = options._replace(resume=last)
+        runs = _runs(arguments)
+        if running := [run for run in runs if is_being_written(run / CHECKPOINTS)]:
+            sys.exit(f"--resume last: another process is training in {running[-1]}")
+        begun = [run for run in runs if has_checkpoint(run / CHECKPOINTS) or _resumed_from(run) is not None]
+        options = options._replace(resume=begun[-1] if begun else None)
     if options.resume is None:
         return options._replace(keep=options.keep or KEEP), arguments
     try:
@@ -162,24 +163,18 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
     return options._replace(freq=freq, keep=keep, exact=exact, checkpoint=checkpoint, record=record), arguments
 
 
-def find_last_run(arguments: Sequence[str]) -> Path | None:
-    """
-    :param arguments: Arguments for RL Zoo
-    :return: The last run folder of its algorithm and environment with a checkpoint to go on from; None where there is none
-    """
+def _runs(arguments: Sequence[str]) -> list[Path]:
+    """The run folders of an algorithm and an environment, the last one last."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="ppo")
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
     given, _ = parser.parse_known_args(arguments)
-    runs = re.compile(re.escape(given.env.replace("/", "-")) + r"_(\d+)(_[-0-9a-f]{36})?")  # the latter by --uuid
+    name = re.compile(re.escape(given.env.replace("/", "-")) + r"_(\d+)(_[-0-9a-f]{36})?")  # the latter by --uuid
     numbers = {
-        folder: int(match[1])
-        for folder in (given.log_folder / given.algo).glob("*")
-        if (match := runs.fullmatch(folder.name))
-        and (has_checkpoint(folder / CHECKPOINTS) or _resumed_from(folder) is not None)
+        folder: int(match[1]) for folder in (given.log_folder / given.algo).glob("*") if (match := name.fullmatch(folder.name))
     }
-    return max(numbers, key=numbers.__getitem__, default=None)
+    return sorted(numbers, key=numbers.__getitem__)
 
 
 def write_resumed_from(run: Path, checkpoint: Path) -> None:

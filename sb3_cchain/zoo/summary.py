@@ -18,6 +18,7 @@ from sb3_cchain.callbacks import task_averages
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV
 from sb3_cchain.callbacks.task_progress_bar import as_clock
+from sb3_cchain.checkpoint.checkpoint_folder import step_folders
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
@@ -163,8 +164,8 @@ class TrainingSummary:
 
     def _places(self) -> dict[str, Path]:
         places = {"Model": self._folder / f"{self._name}.zip", "Best model": self._folder / "best_model.zip"}
-        if checkpoints := sorted((self._folder / CHECKPOINTS).glob("step_*")):
-            places["Checkpoint"] = checkpoints[-1]
+        if checkpoints := step_folders(self._folder / CHECKPOINTS):
+            places["Checkpoint"] = checkpoints[0]
         if (logs := log_folder(self._model)) is not None:
             places.update({"TensorBoard": logs, "Returns": logs / RETURNS_CSV})
         return {title: path for title, path in places.items() if path.exists()}
