@@ -444,10 +444,22 @@ def test_a_copy_beside_the_checkpoints_is_left_alone(path, name):
     assert find_checkpoint(path).num_timesteps == 128
 
 
-def test_a_copy_keeps_its_pieces(dqn_path):
-    copy = Path(shutil.copytree(min(dqn_path.glob("step_*")), dqn_path / "step_best"))
+def test_a_damaged_piece_is_written_again(dqn_path):
+    """Training that goes on from before comes to the same content, and the file of its name is there."""
+    checkpoint = find_checkpoint(dqn_path)
+    other = set(find_checkpoint(min(dqn_path.glob("step_*"))).info["chunks"])
+    piece = next(name for name in checkpoint.info["chunks"] if name not in other)
+    damage(next((dqn_path / "chunks").rglob(f"{piece}.z")), "torn")
+    with pytest.warns(UserWarning, match="An older checkpoint is taken instead"):
+        resume(dqn_path, make_env(), [TrainingCheckpoint(32, dqn_path, keep=9), Stop(float("inf"))], device="cpu")
+    again = find_checkpoint(checkpoint.path)
+    assert piece in again.info["chunks"] and again.num_timesteps == checkpoint.num_timesteps
+
+
+@pytest.mark.parametrize("name", ["step_best", "best"])
+def test_a_copy_keeps_its_pieces(dqn_path, name):
+    copy = Path(shutil.copytree(min(dqn_path.glob("step_*")), dqn_path / name))
     resume(dqn_path, make_env(), [TrainingCheckpoint(16, dqn_path, keep=1), Stop(float("inf"))], device="cpu")
-    assert len(names(dqn_path)) == 2
     assert find_checkpoint(copy).num_timesteps < find_checkpoint(dqn_path).num_timesteps
 
 

@@ -32,6 +32,8 @@ from sb3_cchain.validation import check_path
 FORMAT = 3
 INFO, MODEL, STATE = "checkpoint.json", "model.zip", "training.pkl"
 LOCK = ".lock"
+# Before the name of a checkpoint in place of which an older one was taken
+DAMAGED = "damaged_"
 PACKAGES = ("sb3-cchain", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy")
 
 
@@ -250,6 +252,8 @@ class CheckpointFolder:
             raise
         for unfinished in path.glob(".step_*"):
             shutil.rmtree(unfinished)
+        # A damaged piece would pass for one that is there already, when training comes to the same content again
+        self.remove_useless_chunks()
 
     def _check_newest(self, newest: int | None) -> None:
         there = step_folders(self.path)
@@ -261,8 +265,7 @@ class CheckpointFolder:
             )
         later = [folder for folder in there if newest is not None and _step(folder) > newest]
         for folder in [folder for folder in later if _whole(folder) is None]:
-            # In place of which an older one was taken
-            aside = folder.with_name(f"damaged_{folder.name}")
+            aside = folder.with_name(f"{DAMAGED}{folder.name}")
             shutil.rmtree(aside, ignore_errors=True)
             os.rename(folder, aside)
             later.remove(folder)
@@ -309,9 +312,10 @@ class CheckpointFolder:
     def remove_useless_chunks(self) -> None:
         """Remove the pieces of big arrays that no checkpoint needs, as of one that could not be written."""
         needed: set[str] = set()
-        for file in self.path.glob(f"step_*/{INFO}"):  # copies, too
-            with suppress(ValueError):  # a damaged one, which is of no use any more
-                needed.update(_read_info(file.parent)["chunks"])
+        for file in self.path.glob(f"*/{INFO}"):  # copies by other names, too
+            if not file.parent.name.startswith(DAMAGED):
+                with suppress(ValueError):  # a damaged one, which is of no use any more
+                    needed.update(_read_info(file.parent)["chunks"])
         self.store.remove_all_but(needed)
 
     def _remove_old(self) -> None:
