@@ -2,7 +2,7 @@
 The table and the picture of the README, and the tables behind them in the documentation, from the committed results of Gym
 Control. Trains nothing.
 
-    python -m benchmarks.run --suite gym_control --method vanilla cchain oracle --seeds 0   # makes the runs
+    python -m benchmarks.run --suite gym_control --method vanilla cchain oracle --seeds 0 1   # makes the runs
     python -m benchmarks.readme            # prints the tables
     python -m benchmarks.readme --write    # tables and picture, into README and documentation
 """
