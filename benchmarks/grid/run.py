@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 # Of lines with another strength than the shipped one, in the order of the tables
 STRENGTH_COLORS = (
     *("navy", "deepskyblue", "mediumpurple", "turquoise", "slateblue"),
-    *("black", "sienna", "hotpink", "darkgreen", "maroon"),
+    *("lightcoral", "sienna", "hotpink", "darkgreen", "maroon"),
 )
 
 

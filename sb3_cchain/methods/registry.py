@@ -242,7 +242,7 @@ REGISTRY = (
         optimizer_kwargs={"n_output_layers": 2},
         policy=LayerNormPolicy,
     ),
-    _network("fourier", "Deep Fourier features", "magenta", FourierPolicy, policy_kwargs={"activation_fn": FourierFeatures}),
+    _network("fourier", "Deep Fourier features", "blue", FourierPolicy, policy_kwargs={"activation_fn": FourierFeatures}),
     _callback(
         "continual_backprop",
         "Continual backprop",
