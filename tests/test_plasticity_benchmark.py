@@ -61,7 +61,8 @@ def test_what_is_compared_in_each_suite(suite, env_id, names, monkeypatch):
     for name in names:
         run = watched_run(suite, name, env_id, 0, 2, 8000)
         callbacks, *others = run.overrides
-        assert "'sb3_cchain.TaskSync', 'sb3_cchain.ContinualMetrics'" in callbacks
+        # What looks at the network comes before what changes it
+        assert "['sb3_cchain.TaskSync', 'sb3_cchain.ChurnMonitor'" in callbacks and "sb3_cchain.ContinualMetrics" in callbacks
         assert "'times': [8000, 12000, 16000]" in callbacks and "NetworkHealth" in callbacks
         assert others == ([f"churn_component:'{name}'"] if name in COMPONENTS else [])
         assert run.line == name and run.experiment == "plasticity_2x8000" and name in lines(suite)

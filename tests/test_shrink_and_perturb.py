@@ -1,11 +1,14 @@
 """Shrink-and-perturb."""
 
+from functools import partial
+
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cchain import ContinualEnv, TaskSync
 from sb3_cchain.methods import ShrinkAndPerturb
 from sb3_cchain.methods import shrink_and_perturb as module
 from tests.envs import CountEnv, RandomEnv
@@ -128,3 +131,35 @@ def test_what_it_refuses():
     box = RandomEnv(action_space=spaces.Box(-1, 1, (2,)))
     with pytest.raises(TypeError, match=r"ShrinkAndPerturb is for algorithms with a single optimiser .*, got SAC"):
         SAC("MlpPolicy", box, buffer_size=10, device="cpu").learn(10, callback=ShrinkAndPerturb())
+
+
+def test_the_noise_of_a_rollout_is_that_of_its_probabilities():
+    """With gSDE, the noise of a rollout is drawn before the callbacks' turn."""
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            policy = self.model.policy
+            distribution = policy.action_dist
+            expected = distribution.get_std(policy.log_std)
+            seen.append((distribution.exploration_mat.abs() / expected).max().item())
+            return True
+
+    env = ContinualEnv([partial(RandomEnv, action_space=spaces.Box(-1, 1, (2,)))] * 2, 32)
+    model = make_model("PPO", env, use_sde=True, policy_kwargs=dict(net_arch=[8], log_std_init=-6))
+    draws = ShrinkAndPerturb(shrink=0.01, interval=None)
+    log_std = model.policy.log_std
+
+    class Grow(BaseCallback):
+        """What training would do in a long time."""
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            with th.no_grad():
+                log_std.fill_(2.0)
+
+    model.learn(64, callback=[TaskSync(), draws, Watch(), Grow()])
+    assert draws.n_steps == 1
+    assert max(seen) < 6  # standard deviations

@@ -3,12 +3,15 @@
 import pytest
 import torch as th
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
+from sb3_cchain import TaskSync
+from sb3_cchain.methods import ReDo, ShrinkAndPerturb
 from sb3_cchain.methods.layer_reset import LayerReset
 from sb3_cchain.networks import SpectralNormDQNPolicy, SpectralNormLinear, SpectralNormPolicy
 from sb3_cchain.networks.evaluation_mode import has_training_mode
-from tests.method_models import make_model, make_random_env, parameters
+from tests.method_models import STEPS_PER_TASK, make_model, make_random_env, parameters
 
 NET = dict(net_arch=[8, 8])
 
@@ -123,3 +126,21 @@ def test_a_reset_layer_has_the_vector_of_its_draw():
         sigma = (layer.weight.T @ layer.running_u).norm().item()
         assert sigma == pytest.approx(th.linalg.matrix_norm(layer.weight, 2).item(), rel=0.02)
         assert th.equal(layer.weight, target.weight)
+
+
+@pytest.mark.parametrize("method", [ShrinkAndPerturb(shrink=0.2, interval=None), ReDo(tau=0.5, interval=1)])
+def test_a_method_that_changes_weights_leaves_norm_1(method):
+    norms = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            for layer in layers(self.model.policy):
+                sigma = (layer.weight.T @ layer.running_u).norm()
+                norms.append((th.linalg.matrix_norm(layer.weight, 2) / sigma).item())
+            return True
+
+    policy_kwargs = dict(net_arch=[16, 16], activation_fn=nn.ReLU)
+    model = make_model("PPO", policy=SpectralNormPolicy, policy_kwargs=policy_kwargs)
+    model.learn(3 * STEPS_PER_TASK, callback=[TaskSync(), method, Watch()])
+    assert getattr(method, "n_steps", 0) or method.n_recycled
+    assert max(norms) == pytest.approx(1, abs=0.03)

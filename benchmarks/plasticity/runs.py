@@ -68,7 +68,7 @@ def watched_run(suite: str, name: str, env_id: str, seed: int, n_tasks: int, ste
     :param seed: Seed
     :param n_tasks: Length of the task sequence
     :param steps: Environment steps per task
-    :return: The run, with the monitors after the callbacks of the shipped hyperparameters
+    :return: The run, with the monitors beside the callbacks of the shipped hyperparameters
     :raises ValueError: As :func:`~benchmarks.grid.run.make_run`, and for a component where there are none
     """
     is_component = name in COMPONENTS
@@ -76,7 +76,8 @@ def watched_run(suite: str, name: str, env_id: str, seed: int, n_tasks: int, ste
         raise ValueError(f"`method` must not be a component of C-CHAIN's gradient in {suite}, which has none; got {name}")
     run = make_run(suite, env_id, "cchain" if is_component else name, seed, n_tasks, steps, f"{EXPERIMENT}_{n_tasks}x{steps}")
     shipped = shipped_hyperparameters(run.algo, env_id) or {}
-    overrides = (*run.overrides, f"callback:{[*shipped.get('callback', []), *monitors(run, shipped)]}")
+    sync, *others = shipped["callback"]  # monitors come before what changes the network
+    overrides = (*run.overrides, f"callback:{[sync, *monitors(run, shipped), *others]}")
     if is_component:
         return replace(run, variant=name, overrides=(*overrides, f"churn_component:'{name}'"))
     return replace(run, overrides=overrides)

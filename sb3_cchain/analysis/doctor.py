@@ -25,6 +25,7 @@ from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.networks.batch_outputs import Batch
 from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tasks.callback_tree import require_unchanged_network
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -74,6 +75,7 @@ class Doctor(TrainingInterval):
         self._hooks = TrainingHooks()
 
     def _on_training_start(self) -> None:
+        require_unchanged_network(self)
         super()._on_training_start()
         self._hooks.begin(self.model)
         self._before = None  # may be left from training that was interrupted

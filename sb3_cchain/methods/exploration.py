@@ -82,6 +82,8 @@ class LogStdRestart(TaskBoundary):
         actions have such a one)
     """
 
+    changes_network = True  # between rollouts
+
     model: OnPolicyAlgorithm
 
     def __init__(self, log_std: float | None = None):

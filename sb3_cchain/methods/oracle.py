@@ -38,6 +38,8 @@ class Oracle(TaskBoundary):
         continual, for algorithms with several optimisers, and where there is no replay buffer that can be emptied
     """
 
+    changes_network = True  # between rollouts
+
     def __init__(self, reset_replay_buffer: bool = False):
         super().__init__()
         check_bool("reset_replay_buffer", reset_replay_buffer)

@@ -5,7 +5,9 @@ import torch as th
 from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.methods.fresh_policy import fresh_policy, require_policy_optimizer
+from sb3_cchain.networks.spectral_norm import settle_spectral_norms
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -51,6 +53,7 @@ class ShrinkAndPerturb(TaskBoundary):
             check_number("interval", interval, 1, integer=True)
         self.shrink = shrink
         self.interval = interval
+        self.changes_network = interval is None  # between rollouts
         self._n_updates = 0
         self._hooks = TrainingHooks()
 
@@ -58,6 +61,7 @@ class ShrinkAndPerturb(TaskBoundary):
         require_policy_optimizer(self)
 
     def _on_training_start(self) -> None:
+        require_single(self)
         self._hooks.begin(self.model)
         self.n_steps = 0
         if self.interval is None:
@@ -82,6 +86,9 @@ class ShrinkAndPerturb(TaskBoundary):
 
     def _on_task_switch(self) -> None:
         self._shrink_and_perturb()
+        if getattr(self.model, "use_sde", False):
+            # The rollout's exploration noise has been drawn from the standard deviation that is gone
+            self.model.policy.reset_noise(self.model.n_envs)  # type: ignore[operator]
         forget_references(self)
 
     def _shrink_and_perturb(self) -> None:
@@ -92,6 +99,7 @@ class ShrinkAndPerturb(TaskBoundary):
                 for parameter, draw in zip(group["params"], fresh_group["params"], strict=True):
                     if parameter.requires_grad:
                         parameter.mul_(self.shrink).add_(draw, alpha=1 - self.shrink)
+        settle_spectral_norms(self.model.policy)
         self.n_steps += 1
 
     def _on_rollout_end(self) -> None:

@@ -22,6 +22,8 @@ from sb3_cchain.methods.hidden_units import HiddenUnits, find_hidden_units
 from sb3_cchain.methods.plain_networks import check_plain_networks
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.evaluation_mode import evaluation_mode
+from sb3_cchain.networks.spectral_norm import settle_spectral_norms
+from sb3_cchain.tasks.callback_tree import require_single
 from sb3_cchain.validation import check_number
 
 
@@ -42,6 +44,7 @@ class UnitRecycling(BaseCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
+        require_single(self)
         self.n_recycled: int = 0
         policy = uncompiled(self.model.policy)
         with evaluation_mode(policy):
@@ -76,6 +79,7 @@ class UnitRecycling(BaseCallback):
             policy, fresh = uncompiled(self.model.policy), fresh_policy(self.model)
             for layer, units in zip(self._layers, chosen, strict=True):
                 recycle_units(layer, units, policy, fresh, policy.optimizer, self.reset_steps)
+            settle_spectral_norms(policy)
 
 
 class IntervalRecycling(UnitRecycling, TrainingInterval):
@@ -92,6 +96,8 @@ class IntervalRecycling(UnitRecycling, TrainingInterval):
     :param batch_size: Observations to look at
     :param defaults: The default intervals of on-policy algorithms and of DQN
     """
+
+    changes_network = True  # between rollouts
 
     model: OnPolicyAlgorithm | DQN
 

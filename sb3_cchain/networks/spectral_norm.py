@@ -4,6 +4,9 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+# From a vector that knows nothing of the weight
+N_ITERATIONS = 15
+
 
 class SpectralNormLinear(nn.Linear):
     r"""
@@ -26,7 +29,7 @@ class SpectralNormLinear(nn.Linear):
     def __init__(self, in_features: int, out_features: int):
         super().__init__(in_features, out_features)
         self.register_buffer("running_u", F.normalize(th.randn(out_features), dim=0))
-        self.iterate(15)
+        self.iterate(N_ITERATIONS)
 
     @th.no_grad()
     def iterate(self, n_iterations: int = 1) -> None:
@@ -50,3 +53,14 @@ class SpectralNormLinear(nn.Linear):
         if self.training:
             self.iterate()
         return outputs
+
+
+def settle_spectral_norms(network: nn.Module) -> None:
+    """
+    Estimate the singular values again, after something other than an update has changed the weights.
+
+    :param network: A network, which may have no :class:`SpectralNormLinear`
+    """
+    for module in network.modules():
+        if isinstance(module, SpectralNormLinear):
+            module.iterate(N_ITERATIONS)

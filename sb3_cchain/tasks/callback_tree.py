@@ -48,6 +48,21 @@ def require_single(callback: BaseCallback) -> None:
         raise ValueError(f"`learn()` was given {n_callbacks} callbacks {kind.__name__}: give it one")
 
 
+def require_unchanged_network(callback: BaseCallback) -> None:
+    """
+    :param callback: A callback that looks at the network between rollouts, when training starts
+    :raises ValueError: When ``learn()`` was given a callback before it that changes the network then
+    """
+    for given in iterate_callbacks(callback.locals.get("callback")):
+        if given is callback:
+            return
+        if getattr(given, "changes_network", False):
+            raise ValueError(
+                f"{type(callback).__name__} must come before {type(given).__name__}, which changes the network at the same "
+                "time: what it says would be of the changed network. Give it to `learn()` first."
+            )
+
+
 def will_be_restored(callback: BaseCallback) -> bool:
     """
     :param callback: A callback, when training starts
