@@ -57,6 +57,8 @@ def compose(one, other, algorithm="PPO"):
     )
     for method in reversed([method for method in methods if method.optimizer_class is not None]):
         kwargs = optimizer_arguments(method)
+        if "n_output_layers" in kwargs and any(method.name == "plasticity_injection" for method in methods):
+            kwargs["n_output_layers"] = 6  # an old, a new and a copied one for each head
         if "optimizer_class" in policy_kwargs:
             inside = (policy_kwargs["optimizer_class"], policy_kwargs["optimizer_kwargs"])
             kwargs.update(base_class=inside[0], base_kwargs=inside[1])

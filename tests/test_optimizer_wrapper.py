@@ -279,3 +279,10 @@ def test_refuses():
             cls(parameters, **argument)
     with pytest.raises(TypeError, match="`betas` must be a list"):
         TRAC(parameters, betas=0.9)
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_arguments_of_the_optimiser_inside_are_named(name):
+    cls, kwargs = WRAPPERS[name]
+    with pytest.raises(TypeError, match=rf"{cls.__name__} has no argument amsgrad, foreach\. .* `base_kwargs=dict\(\.\.\.\)`"):
+        cls(make_network().parameters(), **kwargs, amsgrad=True, foreach=True)

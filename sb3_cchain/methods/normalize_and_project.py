@@ -64,19 +64,25 @@ class NormalizeAndProject(OptimizerWrapper):
         self.n_output_layers = n_output_layers
         self.interval = interval
         super().__init__(params, lr, **kwargs)
-        if not self.weights(self.n_output_layers):
+        if not self.matrices():
             raise ValueError(f"`n_output_layers` must leave a weight matrix to project, got {n_output_layers!r}")
+
+    def matrices(self) -> list[th.Tensor]:
+        """
+        :return: The weights that it projects
+        """
+        return self.weights(self.n_output_layers)
 
     def _step(self) -> None:
         if "initial_norms" not in self.own_state:
-            self.own_state["initial_norms"] = _norms(self.weights(self.n_output_layers))
+            self.own_state["initial_norms"] = _norms(self.matrices())
         super()._step()
         self.own_state["n_updates"] = self.own_state.get("n_updates", 0) + 1
         if self.own_state["n_updates"] % self.interval == 0:
             self._project()
 
     def _project(self) -> None:
-        weights = self.weights(self.n_output_layers)
+        weights = self.matrices()
         norms = _norms(weights)
         initial = self.own_state["initial_norms"].to(norms.device)
         for weight, factor in zip(weights, th.where(norms > 0, initial / norms, 1.0), strict=True):

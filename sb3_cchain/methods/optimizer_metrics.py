@@ -4,6 +4,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
+from sb3_cchain.methods.output_layers import check_output_layers
 from sb3_cchain.networks.model_optimizers import model_optimizers
 
 
@@ -14,7 +15,9 @@ class OptimizerMetrics(BaseCallback):
 
     With separate optimisers of actor and critic (SAC, TD3) the names end in ``_actor`` and ``_critic``.
 
-    It raises a ``TypeError`` when no optimiser of the model is an :class:`~sb3_cchain.methods.OptimizerWrapper`.
+    It raises a ``TypeError`` when no optimiser of the model is an :class:`~sb3_cchain.methods.OptimizerWrapper`, and a
+    ``ValueError`` when one acts on weights that it is to leave alone: on output layers, as ``n_output_layers`` does not fit
+    the policy, or on the ``log_std`` of gSDE.
     """
 
     def _init_callback(self) -> None:
@@ -25,6 +28,7 @@ class OptimizerMetrics(BaseCallback):
                 "OptimizerMetrics needs an optimiser of sb3_cchain.methods, as policy_kwargs=dict(optimizer_class=TRAC); "
                 f"{type(self.model).__name__} has {names or 'none'}"
             )
+        check_output_layers(self.model)
 
     def _on_step(self) -> bool:
         # Off-policy rollouts are a few steps long

@@ -31,7 +31,8 @@ class OptimizerWrapper(th.optim.Optimizer):
     :param base_class: Class of the optimiser inside, which may be another wrapper. It must not need a closure, as LBFGS does.
     :param base_kwargs: Its keyword arguments, learning rate excluded. SB3 gives ``eps=1e-5`` to a plain Adam in actor-critic
         policies, but to no other class. To get the same here, set ``base_kwargs=dict(eps=1e-5)``.
-    :raises TypeError: When ``base_class`` is not an optimiser class, or needs a closure
+    :raises TypeError: When ``base_class`` is not an optimiser class, or needs a closure, and for arguments that it does not
+        have
     :raises ValueError: When a wrapper is nested in another one of its kind
     """
 
@@ -47,7 +48,13 @@ class OptimizerWrapper(th.optim.Optimizer):
         *,
         base_class: type[th.optim.Optimizer] = th.optim.Adam,
         base_kwargs: dict[str, Any] | None = None,
+        **unknown: Any,
     ):
+        if unknown:
+            raise TypeError(
+                f"{type(self).__name__} has no argument {', '.join(unknown)}. Give those of the optimiser inside as "
+                "`base_kwargs=dict(...)`."
+            )
         if not (isinstance(base_class, type) and issubclass(base_class, th.optim.Optimizer)):
             raise TypeError(f"`base_class` must be a class of optimisers, got {base_class!r}")
         if inspect.signature(base_class.step).parameters["closure"].default is inspect.Parameter.empty:
@@ -98,6 +105,12 @@ class OptimizerWrapper(th.optim.Optimizer):
         """
         weights = [parameter for parameter in self.parameters() if parameter.dim() > 1]
         return weights[: max(len(weights) - n_output_layers, 0)]
+
+    def matrices(self) -> list[th.Tensor]:
+        """
+        :return: The parameters that it treats as weight matrices; none if it treats all parameters alike
+        """
+        return []
 
     def reference(self) -> list[th.Tensor]:
         """

@@ -57,8 +57,14 @@ class Parseval(Penalty):
         self.n_output_layers = n_output_layers
         self.scale = scale
         super().__init__(params, lr, coef=coef, **kwargs)
-        if not self.weights(self.n_output_layers):
+        if not self.matrices():
             raise ValueError(f"`n_output_layers` must leave a weight matrix to regularise, got {n_output_layers!r}")
+
+    def matrices(self) -> list[th.Tensor]:
+        """
+        :return: The weights that it regularises
+        """
+        return self.weights(self.n_output_layers)
 
     def _deviation(self, matrix: th.Tensor) -> th.Tensor:
         deviation = matrix @ matrix.T
@@ -69,16 +75,14 @@ class Parseval(Penalty):
         """
         :return: Σ ‖W Wᵀ − s·I‖²_F
         """
-        return th.stack(
-            [self._deviation(weight.flatten(start_dim=1)).square().sum() for weight in self.weights(self.n_output_layers)]
-        ).sum()
+        return th.stack([self._deviation(weight.flatten(start_dim=1)).square().sum() for weight in self.matrices()]).sum()
 
     def gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """
         :return: 4 (W Wᵀ − s·I) W for each weight matrix W
         """
         gradients = []
-        for weight in self.weights(self.n_output_layers):
+        for weight in self.matrices():
             matrix = weight.flatten(start_dim=1)
             gradients.append((weight, (4 * self._deviation(matrix) @ matrix).view_as(weight)))
         return gradients

@@ -23,7 +23,8 @@ class SpectralRegularization(Penalty):
     a row for each filter.
 
     It covers all layers, output layers included. SB3's orthogonal initialisation (PPO and A2C) has a gain of √2 in hidden
-    layers and 0.01 in the actor's output; with ``ortho_init=False`` weights begin nearer to 1.
+    layers and 0.01 in the actor's output; with ``ortho_init=False`` weights begin nearer to 1. The ``log_std`` of gSDE is a
+    matrix too and would be regularised, so leave ``use_sde=False``.
 
     The singular value is estimated by power iteration, one step per update, from the vector of the last one. The vectors are
     saved with the model.
@@ -47,9 +48,15 @@ class SpectralRegularization(Penalty):
         self.power = power
         super().__init__(params, lr, coef=coef, **kwargs)
 
+    def matrices(self) -> list[th.Tensor]:
+        """
+        :return: The weights that it regularises
+        """
+        return self.weights()
+
     def _singular(self) -> list[tuple[th.Tensor, th.Tensor, th.Tensor]]:
         """Of each weight matrix the greatest singular value, its left and its right vector."""
-        matrices = [weight.flatten(start_dim=1) for weight in self.weights()]
+        matrices = [weight.flatten(start_dim=1) for weight in self.matrices()]
         known, n_iterations = self.own_state.get("vectors", []), 1
         if len(known) < len(matrices):
             n_iterations = 15
@@ -80,5 +87,5 @@ class SpectralRegularization(Penalty):
         self.own_state["vectors"] = [left for _, left, _ in singular]
         return [
             (weight, (2 * k * (sigma**k - 1) * sigma ** (k - 1) * left.outer(right)).view_as(weight))
-            for weight, (sigma, left, right) in zip(self.weights(), singular, strict=True)
+            for weight, (sigma, left, right) in zip(self.matrices(), singular, strict=True)
         ]

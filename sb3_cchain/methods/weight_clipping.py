@@ -27,7 +27,8 @@ class WeightClipping(OptimizerWrapper):
     - the output layer is clipped like the others.
 
     A vector with no weight before it, such as the ``log_std`` of SB3's actor-critic policies, is left alone; the original
-    fails on it. So are frozen parameters.
+    fails on it. So are frozen parameters. The ``log_std`` of gSDE is a matrix and would be clipped, so leave
+    ``use_sde=False``.
 
     SB3's orthogonal initialisation (PPO and A2C, gain √2) exceeds b in many of the entries. With κ near 1, set
     ``ortho_init=False``, as the C-CHAIN paper's Gym Control does.
@@ -50,6 +51,12 @@ class WeightClipping(OptimizerWrapper):
         check_number("clip_ratio", clip_ratio, minimum=0, exclusive=True)
         self.clip_ratio = clip_ratio
         super().__init__(params, lr, **kwargs)
+
+    def matrices(self) -> list[th.Tensor]:
+        """
+        :return: The weights that it takes a bound from
+        """
+        return self.weights()
 
     def bounds(self) -> list[float]:
         """

@@ -10,6 +10,7 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
 from sb3_cchain.networks.dict_observations import DictObservations
+from sb3_cchain.replaced import replaced
 
 
 class Injectable(nn.Module):
@@ -103,7 +104,9 @@ class InjectionPolicy(DictObservations, ActorCriticPolicy):
         if self.use_sde:
             raise ValueError("`use_sde` must be False for InjectionPolicy, got True")
         _check_activation(self)
-        super()._build(lr_schedule)
+        # The optimiser is made below, for the layers that come now
+        with replaced(self, "optimizer_class", th.optim.SGD), replaced(self, "optimizer_kwargs", {}):
+            super()._build(lr_schedule)
         extractor = self.mlp_extractor
         extractor.policy_net = nn.Sequential(InjectableHidden(extractor.policy_net))
         extractor.value_net = nn.Sequential(InjectableHidden(extractor.value_net))
