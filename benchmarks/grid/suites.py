@@ -88,8 +88,8 @@ SUITES = {
         ),
         checkpoint_freq=20_000,
         # Two fifths of the tasks and of their lengths: 4 x 64 000, and 2 x 128 000 in MountainCar. Four tasks of 80 rollouts
-        # are enough for Vanilla to collapse and C-CHAIN not to (docs/results/gym_control.md). A run takes 9 to 10 minutes of a
-        # core: 72 runs (4 environments, 6 methods, 3 seeds) take less than 12 core-hours
+        # are enough for Vanilla to collapse far more often than C-CHAIN (docs/results/gym_control.md). A run takes 9 to 10
+        # minutes of a core: 72 runs (4 environments, 6 methods, 3 seeds) take less than 12 core-hours
         reduce_length=lambda n_tasks, steps: (n_tasks * 2 // 5, steps * 2 // 5),
         # All methods meet the same offsets under the same seed
         env_kwargs=lambda n_tasks, seed: {"n_tasks": n_tasks, "offset_seed": seed},
