@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from scipy import stats
 
 from benchmarks.grid.results import Result, read_results, write_result
@@ -836,6 +837,26 @@ def test_learning_curves(tmp_path, monkeypatch, suite, env_id, looks, n_axes):
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert set(labels) == {"PPO", "C-CHAIN PPO", *(["random policy"] if looks else [])}
     assert len(figure.axes) == n_axes
+    plt.close(figure)
+
+
+def test_few_seeds_have_a_line_each_and_many_a_band(tmp_path, monkeypatch):
+    import matplotlib.pyplot as plt
+
+    for method, n_seeds in (("vanilla", 4), ("cchain", 3)):
+        for seed in range(n_seeds):
+            write(tmp_path, method, [[0, 1 + seed], [0, 1]], ACROBOT, seed=seed)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    lines = suite_methods("gym_control")
+    plot_learning_curves(whole_results(tmp_path), tmp_path / "a.png", lines)
+    monkeypatch.undo()
+    (figure,) = figures
+    drawn = figure.axes[0].get_lines()
+    styles = {name: [line.get_linestyle() for line in drawn if line.get_color() == lines[name].color] for name in lines}
+    assert styles["vanilla"] == ["-"] * 2  # tasks
+    assert styles["cchain"] == ["-", "--", ":"] * 2
+    assert [band.get_facecolor()[0, :3].tolist() for band in figure.axes[0].collections] == [[*to_rgb("tab:gray")]] * 2
     plt.close(figure)
 
 

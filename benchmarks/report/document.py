@@ -90,8 +90,8 @@ Both scores, of the cells all of whose runs logged what it takes. The other tabl
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
 singular values that hold 99 % of their sum; the sums are those of the absolute values off and on the diagonal. In the table,
-means over the logs of a task and over the seeds. In the pictures, the mean over the seeds (of the logarithms, for the sums)
-with a band of ± one standard error, or a thin line for each of fewer than four seeds."""
+means over the logs of a task and over the seeds. In the pictures, a line for each seed (solid, dashed, dotted), or of more
+than three seeds their mean (of the logarithms, for the sums) with a band of ± one standard error."""
 
 
 def write_report(results: Sequence[Result], experiment: str, folder: Path, left_out: Sequence[str] = ()) -> list[str]:
@@ -266,13 +266,12 @@ def _curves_section(suite: str, results: Sequence[Result], paper: Table, picture
     """Learning curves of each environment."""
     lines = suite_lines(suite, (result.line for result in results))
     window = SUITES[suite].smoothing
-    smooth = f", a running mean over {window} rollouts within a task," if window > 1 else ""
+    smooth = f", which is a running mean over {window} rollouts within a task" if window > 1 else ""
     parts = [
         "### Learning curves",
-        f"The mean{smooth} over all seeds of each method, with a band of ± one standard error, or a thin line for each of "
-        "fewer than four seeds. The methods that the paper compares come first, then the others, a few at a time beside the "
-        "base algorithm. "
-        "Dashed: the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
+        f"A line for each seed (solid, dashed, dotted){smooth}; of more than three seeds of a method, their mean with a band "
+        "of ± one standard error. The methods that the paper compares come first, then the others, a few at a time beside the "
+        "base algorithm. Vertical lines are the task switches. Below, J(T_i) of each run and task: J(T) is their mean.",
     ]
     for env_id, runs in _by_env(results, paper).items():
         parts.append(f"{short_name(env_id)}:")

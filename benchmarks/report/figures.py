@@ -16,13 +16,13 @@ from benchmarks.grid.results import Result
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.quantities import RETURNS, Quantity
 from benchmarks.report.random_policy import TaskLook
-from sb3_cchain.analysis.curves import band, smoothed
+from sb3_cchain.analysis.curves import Series, band, smoothed
 from sb3_cchain.methods.registry import Method
 
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
 
-# Of fewer seeds each has a thin line: a band around the mean of one that learns and one that collapses shows neither
-BAND_SEEDS = 4
+# Of no more seeds than these each has a line: the mean of one that learns and one that collapses is neither
+SEED_STYLES = ("-", "--", ":")
 
 
 def plot_learning_curves(
@@ -158,27 +158,32 @@ def _new_figure(width: float, height: float) -> Any:
 def _draw(
     panels: Sequence[Any], results: Sequence[Result], lines: Mapping[str, Method], quantity: Quantity, window: int
 ) -> None:
-    """Each task in its panel: for each method that has values there the mean, a band or its seeds, and the switches."""
+    """Each task in its panel: for each method that has values there its seeds, or their mean with a band, and the switches."""
     boundaries = results[0].task_boundaries
     for task, panel in enumerate(panels):
         for name, line in lines.items():
-            curves = [quantity.series(result, task) for result in results if result.line == name]
-            curves = [(steps, smoothed(values, window)) for steps, values in curves if len(steps)]
-            if not curves:
-                continue
-            grid, mean, low, high = band(curves, quantity.logarithmic)
-            marker = "o" if len(grid) == 1 else None
-            panel.plot(grid, mean, color=line.color, linewidth=1.8, marker=marker, label=line.label)
-            if len(curves) >= BAND_SEEDS:
-                panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
-            elif len(curves) > 1:
-                for steps, values in curves:
-                    panel.plot(steps, values, color=line.color, linewidth=0.8, alpha=0.5)
+            runs = sorted((result for result in results if result.line == name), key=lambda result: result.seed)
+            curves = [quantity.series(run, task) for run in runs]
+            if any(len(steps) for steps, _ in curves):
+                smooth = [(steps, smoothed(values, window)) for steps, values in curves]
+                _draw_seeds(panel, smooth, line, quantity.logarithmic)
         if task > 0 and panel is panels[task - 1]:
             panel.axvline(boundaries[task - 1], **SWITCH_STYLE)
         panel.set_xlim(boundaries[task - 1] if task and panel is not panels[0] else 0, boundaries[task])
         panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
         panel.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_seeds(panel: Any, curves: Sequence[Series], line: Method, logarithmic: bool) -> None:
+    """A line for each seed, or of more than three seeds their mean and a band."""
+    if len(curves) > len(SEED_STYLES):
+        grid, mean, low, high = band([curve for curve in curves if len(curve[0])], logarithmic)
+        panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
+        curves = [(grid, mean)]
+    for (steps, values), style in zip(curves, SEED_STYLES, strict=False):
+        if len(steps):
+            marker = "o" if len(steps) == 1 else None
+            panel.plot(steps, values, color=line.color, linewidth=1.6, linestyle=style, marker=marker, label=line.label)
 
 
 def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
