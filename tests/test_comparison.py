@@ -25,6 +25,12 @@ def test_band_by_hand():
     assert (low == mean).all() and (high == mean).all()
 
 
+def test_seeds_without_a_common_step_have_no_band():
+    grid, mean, low, high = band([(np.array([0.0, 1.0]), np.array([0.0, 1.0])), (np.array([2.0, 3.0]), np.array([2.0, 3.0]))])
+    assert len(grid) == len(mean) == len(low) == len(high) == 0
+    draw_comparison({"PPO": [run_with([1.0, 2.0]), [dict(row, timesteps=10**6) for row in run_with([1.0])]]}, window=1)
+
+
 def test_smoothed_by_hand():
     assert smoothed(np.array([1.0, 3.0, 8.0, 1.0]), window=2).tolist() == [1.0, 2.0, 5.5, 4.5]
 
@@ -127,6 +133,14 @@ def test_methods_that_lie_on_each_other_can_be_seen():
 def test_the_picture_names_its_band(n_runs, label):
     (axes,) = draw_comparison({"PPO": [run_with([1.0, 2.0])] * n_runs}, window=1).axes
     assert axes.get_ylabel() == label
+
+
+def test_a_single_point_has_an_error_bar():
+    """As where each task has one row."""
+    runs = [[dict(timesteps=512, task_id=0, n_episodes=1, mean_return=value)] for value in (1.0, 3.0)]
+    (axes,) = draw_comparison({"PPO": runs}, window=1).axes
+    ((bar,),) = (collection.get_segments() for collection in axes.collections)
+    assert bar.tolist() == [[512.0, 1.0], [512.0, 3.0]]  # 2 ± 1
 
 
 # The command

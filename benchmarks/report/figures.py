@@ -16,7 +16,7 @@ from benchmarks.grid.results import Result
 from benchmarks.grid.suites import SUITES
 from benchmarks.report.quantities import RETURNS, Quantity
 from benchmarks.report.random_policy import TaskLook
-from sb3_cchain.analysis.curves import Series, band, smoothed
+from sb3_cchain.analysis.curves import Series, draw_band, smoothed
 from sb3_cchain.methods.registry import Method
 
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
@@ -176,14 +176,13 @@ def _draw(
 
 def _draw_seeds(panel: Any, curves: Sequence[Series], line: Method, logarithmic: bool) -> None:
     """A line for each seed, or of more than three seeds their mean and a band."""
+    style: dict[str, Any] = dict(color=line.color, linewidth=1.6, label=line.label)
     if len(curves) > len(SEED_STYLES):
-        grid, mean, low, high = band([curve for curve in curves if len(curve[0])], logarithmic)
-        panel.fill_between(grid, low, high, color=line.color, alpha=0.2, linewidth=0)
-        curves = [(grid, mean)]
-    for (steps, values), style in zip(curves, SEED_STYLES, strict=False):
+        draw_band(panel, [curve for curve in curves if len(curve[0])], logarithmic, **style)
+        return
+    for (steps, values), linestyle in zip(curves, SEED_STYLES, strict=False):
         if len(steps):
-            marker = "o" if len(steps) == 1 else None
-            panel.plot(steps, values, color=line.color, linewidth=1.6, linestyle=style, marker=marker, label=line.label)
+            panel.plot(steps, values, linestyle=linestyle, marker="o" if len(steps) == 1 else None, **style)
 
 
 def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:

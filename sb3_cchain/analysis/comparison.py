@@ -10,7 +10,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from sb3_cchain.analysis.curves import Series, band, smoothed
+from sb3_cchain.analysis.curves import Series, draw_band, smoothed
 from sb3_cchain.analysis.metrics.continual import average_performance
 from sb3_cchain.analysis.metrics.intervals import difference_interval, mean_interval
 from sb3_cchain.analysis.plots import import_matplotlib, new_figure
@@ -114,10 +114,7 @@ def draw_comparison(methods: Methods, window: int) -> "Figure":
             color, style = f"C{number}", LINE_STYLES[number % len(LINE_STYLES)]
             name: str | None = f"{label}, {len(runs)} run{'s' if len(runs) > 1 else ''}"
             for curves_in_task in zip(*runs, strict=False):  # as many tasks as all runs have reached
-                grid, mean, low, high = band(curves_in_task)
-                marker = "o" if len(grid) == 1 else None
-                axes.plot(grid, mean, color=color, linestyle=style, linewidth=1.8, marker=marker, label=name)
-                axes.fill_between(grid, low, high, color=color, alpha=0.2, linewidth=0)
+                draw_band(axes, curves_in_task, color=color, linestyle=style, linewidth=1.8, label=name)
                 name = None  # once in the legend
         longest = max((run for runs in curves.values() for run in runs), key=len)
         for steps, _ in longest[:-1]:

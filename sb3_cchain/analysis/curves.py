@@ -31,10 +31,10 @@ def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[Array, Ar
     :param curves: Environment steps and values of each seed
     :param logarithmic: Whether mean and standard error are those of the logarithms, which no single seed dominates
     :return: Where all seeds have values, by interpolation: environment steps, mean, mean - standard error, mean + standard
-        error (the mean itself for a single seed)
+        error (the mean itself for a single seed). Empty where no step lies between the first and the last of each
     """
     start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
-    grid = np.linspace(start, end, N_POINTS if start < end else 1)
+    grid = np.linspace(start, end, N_POINTS if start < end else int(start == end))
     transform: Callable[[Array], Array] = np.asarray
     inverse = transform
     if logarithmic:
@@ -44,3 +44,20 @@ def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[Array, Ar
     mean = seeds.mean(axis=0)
     error = seeds.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros_like(mean)
     return grid, inverse(mean), inverse(mean - error), inverse(mean + error)
+
+
+def draw_band(axes: Any, curves: Sequence[Series], logarithmic: bool = False, **style: Any) -> None:
+    """
+    Draw the mean of several seeds and a band of ± 1 standard error, an error bar where there is a single point.
+
+    :param axes: matplotlib's
+    :param curves: Environment steps and values of each seed
+    :param logarithmic: As for :func:`band`
+    :param style: ``color``, ``label`` and others of ``axes.plot()``
+    """
+    grid, mean, low, high = band(curves, logarithmic)
+    axes.plot(grid, mean, marker="o" if len(grid) == 1 else None, **style)
+    if len(grid) == 1:
+        axes.vlines(grid, low, high, color=style["color"], linewidth=4, alpha=0.4)
+    else:
+        axes.fill_between(grid, low, high, color=style["color"], alpha=0.2, linewidth=0)
