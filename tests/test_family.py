@@ -1,11 +1,13 @@
 """Churn reduction of all algorithms of Stable-Baselines3 and sb3-contrib, from one table."""
 
 import copy
+import gc
 import pickle
 import sys
 import warnings
 from dataclasses import dataclass
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -342,6 +344,23 @@ def test_a_copy_has_reducers_of_its_own(member):
     assert min(int(reducer.coefficient.n_seen) for reducer in other.churn_reducers.values()) > 0
 
 
+@pytest.mark.parametrize("form", ["untrained", "trained", "callback"])
+@each
+def test_a_model_is_freed_at_once(member, form):
+    """As SB3's: the garbage collector may come late for a replay buffer that fills the memory."""
+    model = member.make(member.stock if form == "callback" else None)
+    if form != "untrained":
+        learn(model, FEW_STEPS, CChainCallback() if form == "callback" else None)
+    gc.collect()  # SB3's callbacks hold the model, and themselves by their `locals`
+    gc.disable()
+    try:
+        there = ref(model)
+        del model
+        assert there() is None
+    finally:
+        gc.enable()
+
+
 # --- Wherever the base runs ------------------------------------------------------------------------------------------------
 
 
@@ -564,8 +583,8 @@ def test_value_churn_is_the_mean_absolute_change(name):
     model, seen = FAMILY[name].make(churn_target="value"), []
     backward = model.churn_reducer.backward
 
-    def spy(*args):
-        old, new = model.churn_reducer.old_outputs, backward(*args)
+    def spy(*args, **kwargs):
+        old, new = model.churn_reducer.old_outputs, backward(*args, **kwargs)
         if new is not None:
             seen.append((old - new).abs().mean().item())
         return new

@@ -1,7 +1,6 @@
 """Saved and loaded, training goes on as if it had never stopped."""
 
 import base64
-import copy
 import json
 import warnings
 import zipfile
@@ -19,7 +18,6 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_cchain import CChainDQN, CChainPPO, ChurnMonitor, DoubleDQN
 from tests.churn_models import (
     ACTION_SPACES,
-    ALGORITHMS,
     DICT,
     DQN_SETTINGS,
     FORMS,
@@ -150,25 +148,6 @@ def test_another_window_starts_over(tmp_path, form):
     loaded = save_and_load(model, tmp_path, churn_window=9)
     assert loaded.churn_reducer.coefficient.value == 1 != model.churn_reducer.coefficient.value
     loaded.learn(form.n_timesteps)
-
-
-# SB3's PPO cannot be copied once it was trained
-@pytest.mark.parametrize("name, n_timesteps", [*((name, 0) for name in ALGORITHMS), ("CChainDQN", 50)])
-def test_a_copy_of_the_model_has_a_network_of_its_own(name, n_timesteps):
-    model, _ = ALGORITHMS[name].make()
-    if n_timesteps:
-        model.learn(n_timesteps)
-    observations, outputs = th.ones(2, 4), []
-    copied = copy.deepcopy(model)
-    for reducer in (model.churn_reducer, copied.churn_reducer, model.churn_reducer):
-        reducer.remember(observations)
-        outputs.append(reducer.old_outputs)
-        if reducer is model.churn_reducer:
-            with th.no_grad():
-                for parameter in model.policy.parameters():
-                    parameter.add_(1.0)
-    before, of_copy, after = outputs
-    assert th.equal(before, of_copy) and not th.equal(before, after)
 
 
 @pytest.mark.parametrize("base, algorithm", [(PPO, CChainPPO), (DQN, DoubleDQN), (DQN, CChainDQN), (DoubleDQN, CChainDQN)])

@@ -1,6 +1,7 @@
 """Keeps the state of churn reduction with the model, so that it is saved and training goes on with the same λ."""
 
 from typing import Any
+from weakref import ref
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,11 +22,19 @@ class ChurnState:
     """
 
     def __init__(self, model: BaseAlgorithm, reducers: ChurnReducers, task_switch: TaskSwitch):
-        self.model = model
+        # Weak, so that `del model` frees it at once. It is not saved, and a copy of the model gets a state of its own
+        self._model = ref(model)
         self.reducers = reducers
         self.task_switch = task_switch
         # `model._n_updates` after the last training with churn reduction; None for models that always train with it
         self.n_updates: int | None = None
+
+    @property
+    def model(self) -> BaseAlgorithm:
+        """The model, which must be there still."""
+        model = self._model()
+        assert model is not None
+        return model
 
     def as_dict(self) -> dict[str, Any]:
         """

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch as th
@@ -93,10 +92,10 @@ class ChurnTarget:
     optimizer: str = ""
     needs: tuple[str, ...] = ()
 
-    def of_reference(self, policy: Any, reference: Observations) -> th.Tensor:
+    def of_reference(self, reference: Observations, policy: Any) -> th.Tensor:
         """
-        :param policy: A policy
         :param reference: A reference batch
+        :param policy: A policy
         :return: Its outputs
         """
         if self.needs:
@@ -316,10 +315,9 @@ class ChurnArguments:
             # Without churn reduction any policy will do
             is_off = self.make_coefficient(name, kind, 1.0).is_zero
             divergence = mean_squared_difference if is_off else target.divergence(model.policy)
-            # deepcopy() of the model copies the model in a partial, too; it would not copy a closure
-            outputs = partial(_outputs, model, target)
+            # The reducer is given the policy at each call: a model that it held would be freed by the garbage collector alone
             reducers[name] = ChurnReducer(
-                outputs, divergence, self.make_coefficient(name, kind, target.target_ratios[divergence])
+                target.of_reference, divergence, self.make_coefficient(name, kind, target.target_ratios[divergence])
             )
         return reducers
 
@@ -338,10 +336,6 @@ def _say_when_there_is_no_other_data(model: Any) -> None:
 
 # Stands for an algorithm that is not yet known
 _ANY = ChurnKind({}, "")
-
-
-def _outputs(model: Any, target: ChurnTarget, reference: Observations) -> th.Tensor:
-    return target.of_reference(model.policy, reference)
 
 
 def _of_target(value: float | str | dict[str, float | str], name: str) -> float | str:

@@ -70,7 +70,7 @@ def _hold_still(model: Any, target: ChurnTarget, reducer: ChurnReducer, changes:
     old: th.Tensor | None = reducer.old_outputs
     # As it acts: the running statistics of BatchNorm do not move, and the noise of dropout is no churn
     with as_it_acts(network):
-        new = reducer.backward(reference)
+        new = reducer.backward(reference, policy=model.policy)
     if new is not None:
         assert old is not None
         changes.append(mean_absolute_change(old, new.detach()))

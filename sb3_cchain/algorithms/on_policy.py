@@ -136,7 +136,7 @@ def reduced_on_policy(model: Any, reducers: Mapping[str, ChurnReducer], options:
             reducer.forget_reference()
             return
         old = reducer.old_outputs
-        new = reducer.backward(reference, backward)
+        new = reducer.backward(reference, backward, policy=model.policy)
         if name == "value" and new is not None:
             assert old is not None
             value_churns.append(mean_absolute_change(old, new.detach()))

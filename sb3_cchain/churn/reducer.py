@@ -36,7 +36,8 @@ class ChurnReducer(nn.Module):
 
     The reference batch that awaits its next update, the outputs on it, and the history of λ are in ``state_dict()``.
 
-    :param outputs: Maps observations to the outputs that should not churn. Called with gradients enabled or disabled.
+    :param outputs: Maps observations to the outputs that should not churn. Called with gradients enabled or disabled, and with
+        the further keyword arguments of :meth:`backward` and :meth:`remember`.
     :param divergence: Compares outputs before and after, ``divergence(old, new)``
     :param coefficient: λ
     :raises TypeError: When ``outputs`` or ``divergence`` cannot be called, or ``coefficient`` is a number
@@ -44,7 +45,7 @@ class ChurnReducer(nn.Module):
 
     def __init__(
         self,
-        outputs: Callable[[Any], th.Tensor],
+        outputs: Callable[..., th.Tensor],
         divergence: Divergence,
         coefficient: ChurnCoefficient,
     ):
@@ -68,7 +69,9 @@ class ChurnReducer(nn.Module):
         self._n_samples, self._churn_sum = 0, 0.0
         self._has_warned = False
 
-    def backward(self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward) -> th.Tensor | None:
+    def backward(
+        self, reference: Observations, backward: Callable[[th.Tensor], Any] = th.Tensor.backward, **inputs: Any
+    ) -> th.Tensor | None:
         """
         Add the gradient of λ·L_churn, and remember the present outputs on ``reference`` for the next update.
 
@@ -76,6 +79,7 @@ class ChurnReducer(nn.Module):
 
         :param reference: Observations outside the minibatch of the update that is about to be made
         :param backward: Takes λ·L_churn and adds its gradient
+        :param inputs: Further arguments of ``outputs``, such as the network where it does not hold it
         :return: The present outputs on the reference batch of the update before; None where there is none
         :raises ValueError: When the churn loss, or λ times it, is NaN or infinite; the parameters and their gradients have not
             been touched. When the reference batch is empty.
@@ -83,11 +87,11 @@ class ChurnReducer(nn.Module):
         outputs = None
         if self.reference is not None:
             with th.enable_grad():
-                outputs = self._outputs[0](self.reference)
+                outputs = self._outputs[0](self.reference, **inputs)
                 loss = self.loss(outputs)
             if loss.requires_grad:  # not all that the outputs depend on is frozen
                 backward(loss)
-        self.remember(reference)
+        self.remember(reference, **inputs)
         return outputs
 
     def loss(self, new_outputs: th.Tensor) -> th.Tensor:
@@ -124,18 +128,19 @@ class ChurnReducer(nn.Module):
         self._n_samples += n_samples
         self._churn_sum += n_samples * (loss - loss_without_churn)
 
-    def remember(self, reference: Observations, outputs: th.Tensor | None = None) -> None:
+    def remember(self, reference: Observations, outputs: th.Tensor | None = None, **inputs: Any) -> None:
         """
         Keep the present outputs on ``reference`` for the next update.
 
         :param reference: Observations outside the minibatch of the update that is about to be made. They are kept as they are,
             not copied: do not change them in place
         :param outputs: The outputs, without gradient, where the training loop has them
+        :param inputs: As for :meth:`backward`
         :raises ValueError: When the reference batch is empty
         """
         if outputs is None:
             with th.no_grad():
-                outputs = self._outputs[0](reference)
+                outputs = self._outputs[0](reference, **inputs)
         if outputs.numel() == 0:
             raise ValueError(f"The reference batch must not be empty, got outputs of shape {tuple(outputs.shape)}")
         self.reference, self.old_outputs = reference, outputs
