@@ -3,7 +3,7 @@
 import sb3_cchain.gym_notice  # noqa: F401  # isort: skip  # before Stable-Baselines3
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_cchain.algorithms import (
     CChainA2C,
@@ -53,10 +53,19 @@ __all__ = [
 _CONTRIB = ("CChainCrossQ", "CChainMaskablePPO", "CChainQRDQN", "CChainRecurrentPPO", "CChainTQC", "CChainTRPO")
 
 
-def __getattr__(name: str) -> Any:
-    if name in _CONTRIB:
-        return getattr(import_module("sb3_cchain.algorithms.contrib"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if TYPE_CHECKING:  # they would take any name that `__getattr__` is there for
+    from sb3_cchain.algorithms.contrib import CChainCrossQ as CChainCrossQ
+    from sb3_cchain.algorithms.contrib import CChainMaskablePPO as CChainMaskablePPO
+    from sb3_cchain.algorithms.contrib import CChainQRDQN as CChainQRDQN
+    from sb3_cchain.algorithms.contrib import CChainRecurrentPPO as CChainRecurrentPPO
+    from sb3_cchain.algorithms.contrib import CChainTQC as CChainTQC
+    from sb3_cchain.algorithms.contrib import CChainTRPO as CChainTRPO
+else:
+
+    def __getattr__(name: str) -> Any:
+        if name in _CONTRIB:
+            return getattr(import_module("sb3_cchain.algorithms.contrib"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

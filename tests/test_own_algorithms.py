@@ -1,5 +1,6 @@
 """Algorithms, loggers and environments of users that do what SB3 allows, but not what its own do."""
 
+import subprocess
 import sys
 
 import gymnasium as gym
@@ -119,3 +120,23 @@ def test_tasks_whose_reset_takes_no_options(tmp_path):
     pictured.render_mode = "rgb_array"
     assert TaskCaption(pictured).reset()[1] == {}
     assert CommonSpaces(WithoutOptions(), 4, 2, "wrap").reset()[0].shape == (4,)
+
+
+FOR_MYPY = """
+[mypy]
+strict = true
+follow_imports = silent
+ignore_missing_imports = true
+cache_dir = {cache}
+[mypy-torch.*,numpy.*,gymnasium.*,stable_baselines3.*,sb3_contrib.*,matplotlib.*,pandas.*]
+follow_imports = skip
+"""
+
+
+def test_type_checkers_know_which_classes_there_are(tmp_path):
+    """Those of sb3-contrib, too, which are imported when they are asked for."""
+    (tmp_path / "mypy.ini").write_text(FOR_MYPY.format(cache=tmp_path / "cache"))
+    program = "from sb3_cchain import CChainMaskablePPO, CChainPOO\nclass Own(CChainMaskablePPO): pass"
+    command = [sys.executable, "-m", "mypy", "--config-file", str(tmp_path / "mypy.ini"), "-c", program]
+    errors = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True).stdout.splitlines()
+    assert 'has no attribute "CChainPOO"' in errors[0] and errors[1:] == ["Found 1 error in 1 file (checked 1 source file)"]
