@@ -6,6 +6,7 @@ import pickle
 import sys
 import warnings
 from dataclasses import dataclass
+from inspect import Parameter, signature
 from typing import Any
 from weakref import ref
 
@@ -359,6 +360,15 @@ def test_a_model_is_freed_at_once(member, form):
         assert there() is None
     finally:
         gc.enable()
+
+
+@each
+def test_its_signature_shows_the_arguments_of_its_base_and_then_its_own(member):
+    shown, of_base = (list(signature(cls).parameters.values()) for cls in (member.algorithm, member.stock))
+    n_of_base = len(of_base)
+    assert [(each.name, each.default) for each in shown[:n_of_base]] == [(each.name, each.default) for each in of_base]
+    assert {each.kind for each in shown[n_of_base:]} == {Parameter.KEYWORD_ONLY}
+    assert {"churn_coef", "target_churn_ratio", "reset_churn_coef"} <= {each.name for each in shown[n_of_base:]}
 
 
 # --- Wherever the base runs ------------------------------------------------------------------------------------------------

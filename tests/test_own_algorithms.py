@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from inspect import signature
 
 import gymnasium as gym
 import pytest
@@ -39,6 +40,27 @@ def test_an_own_train_is_trained_with_churn_reduction():
         model.learn(256, CChainCallback(churn_coef=coef))
         churns[coef] = model.logger.name_to_value["churn/policy_churn"]
     assert 0 < 10 * churns[1e3] < churns[1e-6]
+
+
+class OfEnv(CChainPPO):
+    def __init__(self, env):
+        super().__init__("MlpPolicy", env, **PPO_SETTINGS)
+
+
+class OneMore(CChainPPO):
+    def __init__(self, *args, more=1, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+class OneBefore(CChainPPO):
+    def __init__(self, before=1, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+def test_the_signature_of_an_own_constructor():
+    assert list(signature(OfEnv).parameters) == ["env"]
+    assert signature(OneMore).parameters.keys() == {*signature(CChainPPO).parameters, "more"}
+    assert list(signature(OneBefore).parameters) == ["before", "args", "kwargs"]
 
 
 class Prefixed(Logger):

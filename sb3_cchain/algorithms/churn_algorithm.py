@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 from sb3_cchain.algorithms.churn_state import keep_churn_state
 from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
+from sb3_cchain.algorithms.full_signature import FullSignature
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.algorithms.reduced_churn import reduced_churn
 from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
@@ -23,7 +24,7 @@ from sb3_cchain.validation import check_bool
 SelfChurnAlgorithm = TypeVar("SelfChurnAlgorithm", bound="ChurnAlgorithm")
 
 
-class ChurnAlgorithm(ZeroRateWarning):
+class ChurnAlgorithm(FullSignature, ZeroRateWarning):
     """
     Makes an algorithm of SB3 or sb3-contrib reduce churn: ``class CChainSAC(ChurnAlgorithm, SAC)``.
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional as F
 
+from sb3_cchain.algorithms.full_signature import FullSignature
 from sb3_cchain.algorithms.q_network import finite_td_loss
 from sb3_cchain.algorithms.zero_rate_warning import ZeroRateWarning
 from sb3_cchain.checkpoint import TrainingCheckpoint
@@ -24,7 +25,7 @@ SelfDoubleDQN = TypeVar("SelfDoubleDQN", bound="DoubleDQN")
 LOSSES: dict[str, Callable[..., th.Tensor]] = {"huber": F.smooth_l1_loss, "mse": F.mse_loss}
 
 
-class DoubleDQN(ZeroRateWarning, DQN):
+class DoubleDQN(FullSignature, ZeroRateWarning, DQN):
     r"""
     Deep Q-Network with Double Q-learning.
 
