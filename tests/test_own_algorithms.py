@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from inspect import signature
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -14,6 +15,7 @@ from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv, TrainingCheckpoint
+from sb3_cchain.algorithms import ChurnAlgorithm
 from sb3_cchain.envs import CommonSpaces, TaskCaption
 from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
 from tests.envs import RandomEnv
@@ -61,6 +63,39 @@ def test_the_signature_of_an_own_constructor():
     assert list(signature(OfEnv).parameters) == ["env"]
     assert signature(OneMore).parameters.keys() == {*signature(CChainPPO).parameters, "more"}
     assert list(signature(OneBefore).parameters) == ["before", "args", "kwargs"]
+
+
+class FewArguments(PPO):
+    def learn(self, total_timesteps, callback=None):
+        return super().learn(total_timesteps, callback, tb_log_name="few")
+
+
+class OwnName(PPO):
+    def learn(self, total_timesteps, tb_log_name="own"):
+        return super().learn(total_timesteps, tb_log_name=tb_log_name)
+
+
+class NameOfSB3(PPO):
+    def learn(self, total_timesteps, callback=None, tb_log_name="PPO"):
+        return super().learn(total_timesteps, callback, tb_log_name=tb_log_name)
+
+
+@pytest.mark.parametrize(
+    "base, args, name",
+    [
+        (FewArguments, (), "few"),
+        (OwnName, (), "own"),
+        (OwnName, ("given",), "given"),
+        (NameOfSB3, (), "Mine"),
+        (NameOfSB3, (None, "given"), "given"),
+    ],
+)
+def test_an_own_learn_keeps_its_arguments_and_its_name(base, args, name, tmp_path):
+    class Mine(ChurnAlgorithm, base):
+        pass
+
+    model = Mine("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **PPO_SETTINGS).learn(32, *args)
+    assert Path(model.logger.dir).name == f"{name}_1"
 
 
 class Prefixed(Logger):

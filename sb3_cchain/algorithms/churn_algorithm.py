@@ -1,5 +1,7 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
+from collections.abc import Callable
+from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch as th
@@ -132,12 +134,14 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
 
             :param total_timesteps: Environment steps to train for
             :param args: As of the base algorithm
-            :param kwargs: As of the base algorithm. The run in TensorBoard is by default named after the class.
+            :param kwargs: As of the base algorithm. The run in TensorBoard is by default named after the class, unless the
+                base algorithm's own ``learn()`` has another default than SB3's.
             :return: The trained model
             """
-            if len(args) < 3:
+            learn = super().learn
+            if _has_sb3s_log_name(type(self), learn, n_given=1 + len(args)):
                 kwargs.setdefault("tb_log_name", type(self).__name__)
-            return super().learn(total_timesteps, *args, **kwargs)
+            return learn(total_timesteps, *args, **kwargs)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         add_overview(self)  # to the logger that was just made
@@ -186,3 +190,13 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
         super().set_parameters(params, exact_match, device)
         self.churn_reducers = self._make_churn_reducers()
         keep_churn_state(self, self.churn_reducers, self._task_switch, past, n_updates)
+
+
+def _has_sb3s_log_name(algorithm: type, learn: Callable[..., Any], n_given: int) -> bool:
+    """Whether ``tb_log_name`` is not among the first arguments, which are given, and SB3's: the name of its class."""
+    later = list(signature(learn).parameters.values())[n_given:]
+    default = next((parameter.default for parameter in later if parameter.name == "tb_log_name"), None)
+    stock = (
+        base for base in algorithm.__mro__ if base.__module__.startswith(("stable_baselines3.", "sb3_contrib.", "sb3_cchain."))
+    )
+    return default in [base.__name__ for base in stock]
