@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv, TrainingCheckpoint
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv, TrainingCheckpoint, resume
 from sb3_cchain.algorithms import ChurnAlgorithm
 from sb3_cchain.envs import CommonSpaces, TaskCaption
 from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
@@ -117,6 +117,33 @@ def test_the_logger_may_have_other_names(algorithm, capsys):
         coefs.append(model.churn_reducer.coefficient.value)
     assert coefs[0] == coefs[1] not in (0, 1)
     assert "agent/" in capsys.readouterr().out
+
+
+class OwnLogger:
+    """Does not derive from SB3's."""
+
+    def __init__(self):
+        self.values = {}
+
+    def record(self, key, value, exclude=None):
+        self.values[key] = value
+
+    record_mean = record
+
+    def dump(self, step=0):
+        pass
+
+
+@pytest.mark.parametrize("algorithm", [CChainPPO, CChainDQN])
+def test_a_logger_that_has_only_what_sb3_calls(algorithm, tmp_path):
+    env = ContinualEnv([RandomEnv, RandomEnv], steps_per_task=24)
+    model = algorithm("MlpPolicy", env, **(PPO_SETTINGS if algorithm is CChainPPO else DQN_SETTINGS))
+    logger = OwnLogger()
+    model.set_logger(logger)
+    model.learn(64, TrainingCheckpoint(32, tmp_path))
+    assert {"churn/loss", "continual/task_id"} <= logger.values.keys()
+    with pytest.warns(UserWarning, match="also logged by OwnLogger"):
+        resume(tmp_path, env)
 
 
 def test_a_loss_that_is_not_logged_is_named():

@@ -13,7 +13,8 @@ def log_folder(model: BaseAlgorithm) -> Path | None:
     """
     if model.tensorboard_log is None and not model._custom_logger:
         return None
-    folder = model.logger.get_dir()
+    # A logger of one's own need not derive from SB3's
+    folder = model.logger.get_dir() if hasattr(model.logger, "get_dir") else None
     return None if folder is None else Path(folder)
 
 

@@ -28,7 +28,7 @@ def describe_log(model: BaseAlgorithm) -> dict[str, Any]:
         Stable-Baselines3 that it writes; and the classes of ``others``
     """
     formats, others = [], []
-    for output in model.logger.output_formats:
+    for output in getattr(model.logger, "output_formats", [model.logger]):
         name = _format(output)
         if name is not None:
             formats.append(name)

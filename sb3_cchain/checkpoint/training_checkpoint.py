@@ -290,8 +290,9 @@ class TrainingCheckpoint(BaseCallback):
             "left_out": left_out,
             "chunks": chunk_names(state),
         }
-        if self.logger.dir is not None:
-            sync_files(Path(self.logger.dir))  # what comes before the checkpoint is not written again
+        log_dir = getattr(self.logger, "dir", None)
+        if log_dir is not None:
+            sync_files(Path(log_dir))  # what comes before the checkpoint is not written again
         path = folder.write(info, self.model.save, state)
         self._last_saved = self.num_timesteps
         self._note_progress()

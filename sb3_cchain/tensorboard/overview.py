@@ -34,7 +34,7 @@ def add_overview(model: BaseAlgorithm) -> None:
 
     :param model: A model that is about to be trained
     """
-    outputs = model.logger.output_formats
+    outputs = getattr(model.logger, "output_formats", [])  # a logger of one's own need not derive from SB3's
     if any(isinstance(output, TensorBoardLayout) for output in outputs):
         return
     for output in outputs:
