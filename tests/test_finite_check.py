@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cchain import CChainCallback, CChainPPO, FiniteCheck, make_lean
@@ -111,7 +112,7 @@ def test_large_values_are_allowed(form, reward):
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_few_and_many_values(dtype, n_values):
     check = FiniteCheck()
-    check.model = SimpleNamespace(get_env=lambda: vectorise(FaultyEnv()))
+    check.model = SimpleNamespace(get_env=lambda: vectorise(FaultyEnv()), policy=None)
     values = np.full((1, n_values), np.finfo(dtype).max)  # whose sum is infinite
     check.locals = {"rewards": np.array([1.0], dtype), "new_obs": values, "dones": np.array([False])}
     assert check._on_step()
@@ -123,6 +124,30 @@ def test_few_and_many_values(dtype, n_values):
     check.locals["rewards"][0] = np.nan
     with pytest.raises(ValueError, match=r"NaN or infinite reward .* it holds nan"):
         check._on_step()
+
+
+class FillsIn(FlattenExtractor):
+    def forward(self, observations):
+        return super().forward(observations).nan_to_num(0.0)
+
+
+FILLS_IN = dict(features_extractor_class=FillsIn, net_arch=[8])
+
+
+@each_form
+@pytest.mark.parametrize("at", [0, 10, 13])
+def test_nan_that_the_extractor_takes_for_a_missing_value(form, at):
+    model, callback = form.make(vectorise(FaultyEnv(), FaultyEnv("observation", at)), policy_kwargs=FILLS_IN)
+    assert model.learn(64, callback).num_timesteps == 64
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@each_form
+def test_infinite_values_that_the_extractor_takes(form):
+    """Nobody says a missing value by them."""
+    model, callback = form.make(vectorise(FaultyEnv("observation", 7, np.inf)), policy_kwargs=FILLS_IN)
+    with pytest.raises(ValueError, match=r"observation at step 7 .* it holds inf"):
+        model.learn(64, callback)
 
 
 # --- What the policy gives -----------------------------------------------------------------------------------------------

@@ -1,15 +1,19 @@
 """Stops training at NaN and infinite values, of the environment or of an actor-critic policy, and says where they are."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.parameter import is_lazy
 
+from sb3_cchain.networks.batch_outputs import policy_kind
 from sb3_cchain.networks.compiled import uncompiled
 
 # Up to about as many values of a step, adding Python's numbers takes less time than NumPy's functions
@@ -18,9 +22,10 @@ FEW_VALUES = 100
 
 class FiniteCheck(BaseCallback):
     """
-    Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked. Of
-    an on-policy algorithm it checks the parameters of the policy that are trained, before each rollout and at the end of
-    training, and what the policy gave after each rollout.
+    Checks the rewards and the observations of each step, and the first observations. Integer observations are not checked. NaN
+    in observations is allowed where the policy's outputs are finite all the same, as with a features extractor that puts
+    numbers in the place of missing values. Of an on-policy algorithm it checks the parameters of the policy that are trained,
+    before each rollout and at the end of training, and what the policy gave after each rollout.
 
     Torch would raise an error, too, but later, and one that names neither the environment nor the step nor the parameter.
     """
@@ -72,16 +77,19 @@ class FiniteCheck(BaseCallback):
             )
 
     def _check_observations(self, observations: Any, index: int | None = None) -> None:
+        takes_nan = partial(_takes_nan, self.model.policy, observations)
         if isinstance(observations, dict):
             for key, values in observations.items():
-                self._check(f"observation {key!r}", values, index)
+                self._check(f"observation {key!r}", values, index, takes_nan)
         else:
-            self._check("observation", observations, index)
+            self._check("observation", observations, index, takes_nan)
 
-    def _check(self, kind: str, values: Any, index: int | None = None) -> None:
+    def _check(self, kind: str, values: Any, index: int | None = None, takes_nan: Callable[[], bool] = lambda: False) -> None:
         """``values`` are those of all environments, or of the one at ``index``."""
         values = np.asarray(values)
         if values.dtype.kind != "f" or np.isfinite(values).all():
+            return
+        if not np.isinf(values).any() and takes_nan():
             return
         bad = ~np.isfinite(values)
         if index is None:
@@ -98,6 +106,20 @@ def _surely_finite(values: NDArray[Any]) -> bool:
     if values.dtype.kind != "f":
         return True
     return values.size <= FEW_VALUES and math.isfinite(sum(values.ravel().tolist()))
+
+
+def _takes_nan(policy: Any, observations: Any) -> bool:
+    """Whether the policy's outputs are finite, as with a features extractor that puts numbers in the place of NaN."""
+    policy = uncompiled(policy)
+    kind = policy_kind(policy)
+    outputs_of = None if kind is None else kind.actions or kind.values
+    if outputs_of is None:
+        return False
+    try:
+        with th.no_grad():
+            return bool(outputs_of(policy, {"observations": policy.obs_to_tensor(observations)[0]}).isfinite().all())
+    except Exception:  # as of torch's distributions; what is wrong with the observations must be said in any case
+        return False
 
 
 def _id(env: VecEnv, index: int) -> str:
