@@ -93,6 +93,37 @@ def test_distribution_of_torch(action_space):
     assert th.equal(kl_divergence(lean, lean), kl_divergence(stock, stock))
 
 
+def in_place(distribution):
+    for each in distribution if isinstance(distribution, list) else [distribution]:
+        if isinstance(each, th.distributions.Normal):
+            each.scale = 0.01 * each.scale
+        else:
+            each.logits[..., 0] = -50.0
+    return distribution
+
+
+def another(distribution):
+    if isinstance(distribution, list):
+        return [another(each) for each in distribution]
+    if isinstance(distribution, th.distributions.Normal):
+        return th.distributions.Normal(distribution.loc + 1, 0.01 * distribution.scale)
+    return type(distribution)(logits=-3 * distribution.logits)
+
+
+@each_space
+@pytest.mark.parametrize("changed", [in_place, another])
+def test_changes_of_torchs_distribution_count(action_space, changed):
+    outputs = 3 * th.randn(100, n_outputs(action_space))
+    results = []
+    for distribution in pair(action_space):
+        distribution.proba_distribution(*([outputs, th.ones(1)] if isinstance(action_space, spaces.Box) else [outputs]))
+        distribution.distribution = changed(distribution.distribution)
+        th.manual_seed(0)
+        actions = distribution.sample()
+        results.append([actions, distribution.log_prob(actions), distribution.entropy(), distribution.mode()])
+    assert all(map(th.equal, *results))
+
+
 # --- Whole trainings -------------------------------------------------------------------------------------------------------
 
 
@@ -152,6 +183,13 @@ class AssigningPolicy(ActorCriticPolicy):
         return distribution
 
 
+class MaskingPolicy(ActorCriticPolicy):
+    def _predict(self, observation, deterministic=False):
+        distribution = self.get_distribution(observation)
+        distribution.distribution.logits[:, 0] = -1e9
+        return distribution.get_actions(deterministic)
+
+
 class OwnDistributionPolicy(ActorCriticPolicy):
     def _get_action_dist_from_latent(self, latent_pi):
         return self.action_dist.proba_distribution(2 * self.action_net(latent_pi))
@@ -162,15 +200,24 @@ class OwnDistributionPolicy(ActorCriticPolicy):
     [
         (PPO, OwnDistributionPolicy, {}),
         (PPO, AssigningPolicy, {}),
+        (PPO, MaskingPolicy, {}),
         (PPO, "MlpPolicy", dict(use_sde=True, env=RandomEnv(action_space=ACTION_SPACES[3]))),
         (MaskablePPO, "MlpPolicy", {}),
     ],
-    ids=["own distribution", "assigned distribution", "gSDE", "maskable"],
+    ids=["own distribution", "assigned distribution", "own prediction", "gSDE", "maskable"],
 )
 def test_other_distributions_stay(algorithm, policy, arguments):
     model = algorithm(policy, **{"env": RandomEnv(), "device": "cpu", **arguments})
     distribution = model.policy.action_dist
     assert make_lean(model).policy.action_dist is distribution
+
+
+def test_masks_of_a_policy_count_in_rollouts_and_predictions():
+    model = CChainPPO("MlpPolicy", RandomEnv(), **PPO_SETTINGS)
+    own = model.policy.get_distribution(th.zeros(1000, 4))
+    own.distribution.logits[:, 0] = -1e9
+    assert (own.get_actions() > 0).all()
+    assert (CChainPPO(MaskingPolicy, RandomEnv(), **PPO_SETTINGS).predict(np.zeros((1000, 4), np.float32))[0] > 0).all()
 
 
 # --- The model around them -------------------------------------------------------------------------------------------------

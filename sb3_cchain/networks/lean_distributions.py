@@ -71,6 +71,11 @@ class _Categorical:
         return _without_nan(self.probs).argmax(dim=1)
 
 
+def _is_torchs(distribution: Distribution) -> bool:
+    """Whether torch's distribution was asked for or put there: it counts from then on, because it may have been changed."""
+    return "distribution" in vars(distribution)
+
+
 class LeanCategorical(CategoricalDistribution):
     """SB3's, without torch's ``Categorical``."""
 
@@ -94,24 +99,32 @@ class LeanCategorical(CategoricalDistribution):
         :param actions: Actions, ``(batch_size,)``
         :return: Log-probabilities, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().log_prob(actions)
         return self._lean.log_prob(actions)
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().entropy()
         return self._lean.entropy()
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().sample()
         return self._lean.sample()
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().mode()
         return self._lean.mode()
 
 
@@ -138,6 +151,8 @@ class LeanMultiCategorical(MultiCategoricalDistribution):
         :param actions: Actions, ``(batch_size, n_sub_actions)``
         :return: Log-probabilities, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().log_prob(actions)
         sub_actions = actions.unbind(dim=1)
         return th.stack([lean.log_prob(action) for lean, action in zip(self._lean, sub_actions, strict=True)], dim=1).sum(
             dim=1
@@ -147,18 +162,24 @@ class LeanMultiCategorical(MultiCategoricalDistribution):
         """
         :return: Entropies, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().entropy()
         return th.stack([lean.entropy() for lean in self._lean], dim=1).sum(dim=1)
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
+        if _is_torchs(self):
+            return super().sample()
         return th.stack([lean.sample() for lean in self._lean], dim=1)
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size, n_sub_actions)``
         """
+        if _is_torchs(self):
+            return super().mode()
         return th.stack([lean.mode() for lean in self._lean], dim=1)
 
 
@@ -184,12 +205,16 @@ class LeanBernoulli(BernoulliDistribution):
         :param actions: Actions, ``(batch_size, n_sub_actions)``
         :return: Log-probabilities, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().log_prob(actions)
         return (-F.binary_cross_entropy_with_logits(self._action_logits, actions, reduction="none")).sum(dim=1)
 
     def entropy(self) -> th.Tensor:
         """
         :return: Entropies, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().entropy()
         probs = self._action_logits.sigmoid()
         return F.binary_cross_entropy_with_logits(self._action_logits, probs, reduction="none").sum(dim=1)
 
@@ -197,12 +222,16 @@ class LeanBernoulli(BernoulliDistribution):
         """
         :return: Actions, ``(batch_size, n_sub_actions)``
         """
+        if _is_torchs(self):
+            return super().sample()
         return _without_nan(self._action_logits.detach().sigmoid()).bernoulli()
 
     def mode(self) -> th.Tensor:
         """
         :return: Most probable actions, ``(batch_size, n_sub_actions)``
         """
+        if _is_torchs(self):
+            return super().mode()
         return _without_nan(self._action_logits.sigmoid()).round()
 
 
@@ -230,6 +259,8 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :param actions: Actions, ``(batch_size, action_dim)``
         :return: Log-densities, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().log_prob(actions)
         variance = self._std**2
         squares = -((actions - self._mean) ** 2) / (2 * variance)
         return sum_independent_dims(squares - self._std.log() - math.log(math.sqrt(2 * math.pi)))
@@ -238,12 +269,16 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         """
         :return: Entropies, ``(batch_size,)``
         """
+        if _is_torchs(self):
+            return super().entropy()
         return sum_independent_dims(0.5 + 0.5 * math.log(2 * math.pi) + self._std.log())
 
     def sample(self) -> th.Tensor:
         """
         :return: Actions, ``(batch_size, action_dim)``, through which gradients flow
         """
+        if _is_torchs(self):
+            return super().sample()
         noise = th.empty(self._mean.shape, dtype=self._mean.dtype, device=self._mean.device).normal_()
         return _without_nan(self._mean + noise * self._std)
 
@@ -251,6 +286,8 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         """
         :return: Means, ``(batch_size, action_dim)``
         """
+        if _is_torchs(self):
+            return super().mode()
         return _without_nan(self._mean)
 
 
@@ -285,7 +322,7 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
 
 
 # Of a policy, those that make its distribution or use it
-_METHODS = ("_get_action_dist_from_latent", "get_distribution", "forward", "evaluate_actions")
+_METHODS = ("_get_action_dist_from_latent", "get_distribution", "forward", "evaluate_actions", "_predict")
 
 
 def _is_sb3s(method: Callable[..., Any]) -> bool:
