@@ -1,6 +1,7 @@
 """In rollouts the layers of a plain MLP policy are called directly, with the same results."""
 
 import copy
+import pickle
 from types import MethodType
 
 import numpy as np
@@ -15,8 +16,9 @@ from torch.nn.modules.module import register_module_forward_hook
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.networks.impala_policy import ImpalaPolicy
-from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly, evaluate_jointly
 from sb3_cchain.networks.lean_forward import LeanForward, has_plain_forward, lean_forward
+from sb3_cchain.networks.policy_networks import PolicyNetworks
 from tests.churn_models import ACTION_SPACES, DICT, IMAGE, PPO_SETTINGS, NormalisedExtractor
 from tests.envs import RandomEnv
 
@@ -126,16 +128,19 @@ def test_same_results_to_the_bit(arguments, deterministic):
 
 @pytest.mark.parametrize("arguments", OTHERS.values(), ids=OTHERS)
 def test_other_policies_stay(arguments):
-    model = make(**arguments)
-    with lean_forward(model.policy):
-        assert "forward" not in vars(model.policy)
+    assert not has_plain_forward(make(**arguments).policy)
 
 
 def test_compiled_and_changed_policies_stay():
     model = make()
-    with lean_forward(th.compile(model.policy, backend="eager")):
-        assert "forward" not in vars(model.policy)
+    assert not has_plain_forward(th.compile(model.policy, backend="eager"))
+    model.policy.compile(backend="eager")
+    compiled = model.policy._compiled_call_impl
+    with lean_forward(model.policy):
+        assert model.policy._compiled_call_impl is compiled
+    model = make()
     own = model.policy.forward = lambda *args: ActorCriticPolicy.forward(model.policy, *args)
+    assert not has_plain_forward(model.policy)
     with lean_forward(model.policy):
         assert model.policy.forward is own
 
@@ -154,9 +159,9 @@ class InRollouts(BaseCallback):
 def test_rollouts_of_cchain_ppo(lean):
     seen = []
     model = make(algorithm=CChainPPO, lean=lean)
-    model.learn(64, InRollouts(lambda model: seen.append(isinstance(model.policy.forward, LeanForward))))
+    model.learn(64, InRollouts(lambda model: seen.append(isinstance(model.policy._compiled_call_impl, LeanForward))))
     assert seen == [lean] * 64
-    assert "forward" not in vars(model.policy)
+    assert model.policy._compiled_call_impl is None
 
 
 def test_nothing_stays_when_training_is_interrupted():
@@ -166,7 +171,7 @@ def test_nothing_stays_when_training_is_interrupted():
     model = make(algorithm=CChainPPO)
     with pytest.raises(KeyboardInterrupt):
         model.learn(64, InRollouts(interrupt))
-    assert "forward" not in vars(model.policy)
+    assert model.policy._compiled_call_impl is None
 
 
 def test_hooks_that_are_registered_in_a_rollout_are_called():
@@ -175,7 +180,7 @@ def test_hooks_that_are_registered_in_a_rollout_are_called():
 
     def register(model):
         if model.num_timesteps == 10:
-            assert isinstance(model.policy.forward, LeanForward)
+            assert isinstance(model.policy._compiled_call_impl, LeanForward)
             model.policy.action_net.register_forward_hook(lambda *_: n_calls.append(model.num_timesteps))
 
     model.learn(32, InRollouts(register))
@@ -195,6 +200,106 @@ def test_layer_put_in_place_in_a_rollout():
     model.train = lambda: None
     model.learn(32, InRollouts(replace))
     assert (model.rollout_buffer.actions[10:] == 2).all() and not (model.rollout_buffer.actions[:10] == 2).all()
+
+
+class Scaled(nn.Flatten):
+    """A features extractor."""
+
+    def __init__(self):
+        super().__init__()
+        self.features_dim = 4
+        self.scale = nn.Parameter(th.tensor(5.0))
+
+    def forward(self, observations):
+        return super().forward(observations) * self.scale
+
+
+class Adapter(nn.Module):
+    """Its children are not called one after the other."""
+
+    def __init__(self, base):
+        super().__init__()
+        self.base, self.down, self.up = base, nn.Linear(4, 2), nn.Linear(2, 64)
+
+    def forward(self, features):
+        return self.base(features) + self.up(self.down(features))
+
+
+def _frozen(policy):
+    layer = policy.mlp_extractor.policy_net[0]
+    weight = layer.weight.detach().clone()
+    del layer.weight
+    layer.register_buffer("weight", weight)
+
+
+def _plain_tensor(policy):
+    layer = policy.action_net
+    bias = layer.bias.detach().clone()
+    del layer.bias
+    layer.bias = bias
+
+
+CHANGES = {
+    "adapter": lambda policy: setattr(policy.mlp_extractor, "policy_net", Adapter(policy.mlp_extractor.policy_net)),
+    "extractor": lambda policy: setattr(policy, "features_extractor", Scaled()),
+    "extractor of the policy": lambda policy: setattr(policy, "pi_features_extractor", Scaled()),
+    "extractor of the values": lambda policy: setattr(policy, "vf_features_extractor", Scaled()),
+    "in the extractor": lambda policy: setattr(policy.features_extractor, "flatten", Scaled()),
+    "method of a layer": lambda policy: setattr(policy.action_net, "forward", lambda latent: latent[:, :3]),
+    "own latent": lambda policy: setattr(policy.mlp_extractor, "forward_critic", policy.mlp_extractor.forward_actor),
+    "hook": lambda policy: policy.mlp_extractor.policy_net.register_forward_hook(lambda _, inputs, output: 2 * output),
+    "buffer": _frozen,
+    "plain tensor": _plain_tensor,
+}
+
+
+class AtRolloutStart(BaseCallback):
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def _on_rollout_start(self):
+        self.change(self.model.policy)
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("share", [True, False])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_changes_at_the_start_of_a_rollout_count_in_it(change, share):
+    model = make(algorithm=CChainPPO, churn_coef=1.0, policy_kwargs=dict(share_features_extractor=share))
+    train, model.train = model.train, lambda: None
+    model.learn(32, AtRolloutStart(change))
+    samples = next(model.rollout_buffer.get(32))
+    values, log_prob, _ = model.policy.evaluate_actions(samples.observations, samples.actions.long().flatten())
+    assert th.allclose(values.flatten(), samples.old_values, atol=1e-5)
+    assert th.allclose(log_prob, samples.old_log_prob, atol=1e-5)
+    model.policy.optimizer = th.optim.Adam(model.policy.parameters())
+    train()
+
+
+def test_forward_set_at_the_start_of_a_rollout_stays():
+    n_calls = []
+
+    def count(policy):
+        forward = policy.forward
+        policy.forward = lambda *args: n_calls.append(None) or forward(*args)
+
+    model = make(algorithm=CChainPPO).learn(32, AtRolloutStart(count))
+    assert len(n_calls) == 32 and "forward" in vars(model.policy)
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_joint_evaluation_takes_the_extractor_that_evaluation_takes(share):
+    policy = make(
+        "MultiInputPolicy", RandomEnv(observation_space=DICT), policy_kwargs=dict(share_features_extractor=share)
+    ).policy
+    extractor = policy.features_extractor = copy.deepcopy(policy.features_extractor)
+    extractor.register_forward_hook(lambda _, inputs, output: 5 * output)
+    obs, _ = policy.obs_to_tensor({name: np.stack([space.sample()] * 3) for name, space in DICT.items()})
+    expected = policy.evaluate_actions(obs, th.tensor([0, 1, 2]))
+    assert all(map(th.allclose, evaluate_jointly(PolicyNetworks(policy), obs, th.tensor([0, 1, 2])), expected))
 
 
 class OwnNetwork(nn.Module):
@@ -242,6 +347,13 @@ def test_copy_of_a_model_in_a_rollout_acts_by_itself():
             parameter.zero_()
         assert policy(th.ones(1, 4))[1] == 0
     assert all(map(th.equal, before, model.policy.parameters()))
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))])
+def test_nothing_is_replaced_on_a_copy_made_in_a_rollout(copied):
+    policies = []
+    make(algorithm=CChainPPO, n_epochs=1).learn(4, InRollouts(lambda model: policies.append(copied(model.policy))))
+    assert all(policy._compiled_call_impl is None and "forward" not in vars(policy) for policy in policies)
 
 
 def test_a_compiled_part_is_no_replaced_method():

@@ -1,7 +1,7 @@
 """The networks of an SB3 actor-critic policy, as functions of observations."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch as th
 from gymnasium import spaces
@@ -15,7 +15,8 @@ from torch.nn import functional as F
 FORWARD_HOOKS = ("_forward_pre_hooks", "_forward_hooks")
 BACKWARD_HOOKS = ("_backward_pre_hooks", "_backward_hooks")
 # What a forward pass calls of a policy and its modules
-_METHODS = ("forward", "extract_features", "forward_actor", "forward_critic")
+_METHODS = ("forward", "extract_features", "_get_action_dist_from_latent", "forward_actor", "forward_critic")
+_EXTRACTORS = ("features_extractor", "pi_features_extractor", "vf_features_extractor")
 
 
 class PolicyNetworks:
@@ -31,14 +32,19 @@ class PolicyNetworks:
         :param observations: Batch of observations
         :return: What ``latent()`` takes
         """
-        return BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+        return self._features(observations, "pi_features_extractor")
 
     def critic_features(self, observations: PyTorchObs) -> th.Tensor:
         """
         :param observations: Batch of observations
         :return: What ``values()`` takes; the actor's features where ``policy.share_features_extractor``
         """
-        return BasePolicy.extract_features(self.policy, observations, self.policy.vf_features_extractor)
+        return self._features(observations, "vf_features_extractor")
+
+    def _features(self, observations: PyTorchObs, own: str) -> th.Tensor:
+        # As `policy.extract_features()`: one that was put in place of the shared extractor is under this name alone
+        name = "features_extractor" if self.policy.share_features_extractor else own
+        return BasePolicy.extract_features(self.policy, observations, getattr(self.policy, name))
 
     def latent(self, features: th.Tensor) -> th.Tensor:
         """
@@ -64,10 +70,10 @@ class PolicyNetworks:
 
 class PlainNetworks(PolicyNetworks):
     """
-    The same operations, without what ``nn.Module.__call__()`` does beside a layer, above all looking for hooks, and without
-    looking up attributes of modules. In a small network, both take about as long as the layers.
+    The same operations, without what ``nn.Module.__call__()`` does beside a layer, and without looking up attributes of
+    modules. In a small network, both take about as long as the layers.
 
-    :param policy: A policy, of which ``is_plain()`` is true
+    :param policy: A policy, of which ``takes_vectors()`` is true, and ``has_mlps()`` whenever it is used
     """
 
     def __init__(self, policy: ActorCriticPolicy):
@@ -99,12 +105,19 @@ class PlainNetworks(PolicyNetworks):
 def _through(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
     """What ``nn.Sequential`` does."""
     for layer in layers:
-        if type(layer) is nn.Linear:
-            parameters: dict[str, Any] = layer._parameters
-            inputs = F.linear(inputs, parameters["weight"], parameters["bias"])
+        own = vars(layer)
+        if own["_forward_hooks"] or own["_forward_pre_hooks"]:
+            inputs = layer(inputs)
+        elif type(layer) is nn.Linear and "forward" not in own and _has_parameters(own["_parameters"]):
+            inputs = F.linear(inputs, own["_parameters"]["weight"], own["_parameters"]["bias"])
         else:
             inputs = layer.forward(inputs)
     return inputs
+
+
+def _has_parameters(parameters: dict[str, Any]) -> bool:
+    """Not so where a weight is a buffer or any other tensor."""
+    return "weight" in parameters and "bias" in parameters
 
 
 def hooks_of(policy: nn.Module, kinds: Sequence[str] = (*FORWARD_HOOKS, *BACKWARD_HOOKS)) -> list[dict[int, Any]]:
@@ -133,17 +146,52 @@ def is_plain(policy: nn.Module) -> bool:
     :return: Whether it is an actor-critic policy of SB3 that takes vectors and has MLPs for actor and critic, without hooks
         and replaced methods
     """
+    return takes_vectors(policy) and has_mlps(policy) and not is_instrumented(policy)
+
+
+def takes_vectors(policy: nn.Module) -> TypeGuard[ActorCriticPolicy]:
+    """
+    :param policy: A policy
+    :return: Whether it is an actor-critic policy that extracts features as SB3's do, from vectors
+    """
     return (
         isinstance(policy, ActorCriticPolicy)  # not so when compiled
         and type(policy).extract_features is ActorCriticPolicy.extract_features
         and isinstance(policy.observation_space, spaces.Box)
         and not is_image_space(policy.observation_space)
-        and type(policy.features_extractor) is FlattenExtractor
-        and type(getattr(policy, "mlp_extractor", None)) is MlpExtractor
-        and type(policy.mlp_extractor.policy_net) is type(policy.mlp_extractor.value_net) is nn.Sequential
-        and not is_instrumented(policy)
+    )
+
+
+def has_mlps(policy: nn.Module) -> bool:
+    """
+    Takes a few microseconds, because it is asked at each step.
+
+    :param policy: A policy, of which ``takes_vectors()`` is true
+    :return: Whether :class:`PlainNetworks` does at the moment what its modules do: they are SB3's MLPs, without own features
+        extractors, and no hook looks at what is not called, nor was a method of it replaced
+    """
+    modules: dict[str, Any] = vars(policy)["_modules"]
+    mlp_extractor = modules.get("mlp_extractor")
+    return (
+        _is_bare(mlp_extractor, MlpExtractor)
+        and _is_bare(mlp_extractor._modules["policy_net"], nn.Sequential)
+        and _is_bare(mlp_extractor._modules["value_net"], nn.Sequential)
+        and all(map(_only_flattens, {modules.get(name) for name in _EXTRACTORS}))
+        and _is_bare(policy, type(policy))
         and not nn.modules.module._has_any_global_hook()  # as those that count operations
     )
+
+
+def _is_bare(module: Any, kind: type[nn.Module]) -> bool:
+    """Whether it is of this very class, and does nothing else than its class says."""
+    if type(module) is not kind:
+        return False
+    own = vars(module)
+    return not own["_forward_hooks"] and not own["_forward_pre_hooks"] and own.keys().isdisjoint(_METHODS)
+
+
+def _only_flattens(extractor: Any) -> bool:
+    return _is_bare(extractor, FlattenExtractor) and _is_bare(extractor._modules["flatten"], nn.Flatten)
 
 
 def networks_of(policy: ActorCriticPolicy) -> PolicyNetworks:
