@@ -6,9 +6,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_cchain import CChainPPO
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
 from sb3_cchain.networks.policy_outputs import policy_outputs
 from tests.churn_models import ACTION_SPACES, FORMS, NormalisedExtractor, assert_churn_was_reduced, assert_equal, churn_keys
 from tests.envs import RandomEnv
@@ -186,6 +188,55 @@ def test_a_policy_with_a_distribution_of_its_own():
     observations = th.randn(5, 4)
     acting = model.policy.get_distribution(observations).distribution.probs
     assert th.allclose(policy_outputs(model.policy, observations), acting)
+
+
+class Tempered(CategoricalDistribution):
+    def proba_distribution(self, action_logits):
+        return super().proba_distribution(50 * action_logits)
+
+
+class Bounded(DiagGaussianDistribution):
+    def proba_distribution(self, mean_actions, log_std):
+        return super().proba_distribution((50 * mean_actions).tanh(), log_std)
+
+
+class NegativePolicy(ActorCriticPolicy):
+    """A method of SB3's distribution is replaced on it."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        proba_distribution = self.action_dist.proba_distribution
+        self.action_dist.proba_distribution = lambda action_logits: proba_distribution(-50 * action_logits)
+
+
+class TemperedClassPolicy(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        self.action_dist = Tempered(int(self.action_space.n))
+        super()._build(lr_schedule)
+
+
+class BoundedClassPolicy(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        self.action_dist = Bounded(self.action_space.shape[0])
+        super()._build(lr_schedule)
+
+
+@pytest.mark.parametrize(
+    "policy, action_space",
+    [
+        (TemperedClassPolicy, spaces.Discrete(3)),
+        (NegativePolicy, spaces.Discrete(3)),
+        (BoundedClassPolicy, spaces.Box(-1, 1, (2,))),
+    ],
+)
+def test_distributions_of_an_own_class_are_held_still_as_they_act(policy, action_space):
+    model = CChainPPO(policy, RandomEnv(action_space=action_space), **SETTINGS).learn(64)
+    assert "Lean" not in type(model.policy.action_dist).__name__
+    observations = th.randn(5, 4)
+    distribution = model.policy.get_distribution(observations).distribution
+    acting = distribution.probs if action_space.shape == () else distribution.mean
+    assert th.allclose(policy_outputs(model.policy, observations), acting)
+    assert not can_evaluate_jointly(model.policy)
 
 
 @pytest.mark.filterwarnings("error")

@@ -24,6 +24,7 @@ from torch.distributions import Bernoulli, Categorical, Normal
 from torch.nn import functional as F
 
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.policy_outputs import is_sb3s
 
 OnPolicyModel = TypeVar("OnPolicyModel", bound=OnPolicyAlgorithm)
 
@@ -316,7 +317,7 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     policy = uncompiled(model.policy)
     # The very class: a subclass may do something else
     make = _LEAN.get(type(policy.action_dist))
-    if make is not None and all(_is_sb3s(getattr(policy, name)) for name in _METHODS):
+    if make is not None and is_sb3s(policy.action_dist) and all(_is_method_of_sb3(getattr(policy, name)) for name in _METHODS):
         policy.action_dist = make(policy.action_dist)
     return model
 
@@ -325,5 +326,5 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
 _METHODS = ("_get_action_dist_from_latent", "get_distribution", "forward", "evaluate_actions", "_predict")
 
 
-def _is_sb3s(method: Callable[..., Any]) -> bool:
+def _is_method_of_sb3(method: Callable[..., Any]) -> bool:
     return method.__module__.startswith(("stable_baselines3.", "sb3_contrib."))

@@ -83,12 +83,23 @@ def distribution_of(policy: ActorCriticPolicy, latent: th.Tensor, outputs: th.Te
 def has_own_distribution(policy: nn.Module) -> bool:
     """
     :param policy: An actor-critic policy
-    :return: Whether it makes its action distribution otherwise than SB3's, by its class or by a method replaced on it
+    :return: Whether it makes its action distribution otherwise than SB3's, by its class or by a method replaced on it, or has
+        one that may make something else of the same outputs
     """
-    return any(
+    return not is_sb3s(getattr(policy, "action_dist", None)) or any(
         getattr(getattr(policy, name), "__func__", None) is not getattr(ActorCriticPolicy, name)
         for name in ("get_distribution", "_get_action_dist_from_latent")
     )
+
+
+def is_sb3s(distribution: Any) -> bool:
+    """
+    :param distribution: An action distribution
+    :return: Whether its class is SB3's or a lean one, and no method was replaced on it
+    """
+    if not type(distribution).__module__.startswith(("stable_baselines3.", "sb3_cchain.")):
+        return False
+    return not any(map(callable, vars(distribution).values()))
 
 
 def distribution_outputs(distribution: Distribution) -> th.Tensor:
