@@ -221,6 +221,20 @@ def test_hooks_see_what_they_see_in_ppo(register):
     assert sizes(CChainPPO) == n_passes * sizes(PPO)
 
 
+def test_hooks_see_training_mode_in_the_updates_alone():
+    """What they do there, such as moving statistics, they do not do on reference batches."""
+
+    def n_training(algorithm):
+        seen = []
+        settings = dict(n_steps=16, batch_size=8, n_epochs=1, seed=0, device="cpu")
+        model = algorithm("MlpPolicy", RandomEnv(), **settings)
+        model.policy.action_net.register_forward_pre_hook(lambda layer, inputs: seen.append(layer.training))
+        model.learn(32)
+        return sum(seen)
+
+    assert n_training(CChainPPO) == n_training(PPO) == 4
+
+
 def test_direct_calls_of_layers_make_the_same_updates():
     models = []
     for plain in (True, False):

@@ -117,6 +117,13 @@ def test_c_chain_looks_at_it_as_it_acts():
         assert has_training_mode(algorithm(policy, make_random_env(), device="cpu").policy)
 
 
+def test_c_chain_looks_at_pytorchs_hook_as_it_acts():
+    policy = PPO("MlpPolicy", make_random_env(), device="cpu").policy
+    assert not has_training_mode(policy)
+    nn.utils.spectral_norm(policy.action_net)
+    assert has_training_mode(policy)
+
+
 def test_a_reset_layer_has_the_vector_of_its_draw():
     model = make_model("DQN", make_random_env(), SpectralNormDQNPolicy, policy_kwargs=NET, learning_rate=0.0)
     before = parameters(model)

@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from torch import nn
 
+from sb3_cchain.networks.policy_networks import FORWARD_HOOKS
 from sb3_cchain.networks.spectral_norm import SpectralNormLinear
 
 # Switching the mode twice per update costs several per cent of an MLP's update, so it is done only where it may matter
@@ -51,13 +52,14 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
 def has_training_mode(policy: nn.Module) -> bool:
     """
     :param policy: A policy
-    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, or
-        a module that is not known here
+    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, a module that
+        is not known here, or a forward hook, which may look at the mode: that of ``torch.nn.utils.spectral_norm()`` does
     """
     return any(
         not type(module).__module__.startswith(_MODE_FREE_PACKAGES)
         or isinstance(module, _MODE_DEPENDENT_MODULES)
         or (isinstance(module, nn.RNNBase) and module.dropout > 0)
+        or any(getattr(module, kind) for kind in FORWARD_HOOKS)
         for module in policy.modules()
     )
 
