@@ -52,8 +52,8 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
 def has_training_mode(policy: nn.Module) -> bool:
     """
     :param policy: A policy
-    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, a module that
-        is not known here, or a forward hook, which may look at the mode: that of ``torch.nn.utils.spectral_norm()`` does
+    :return: Whether it may act otherwise in training than in evaluation mode, as it does with BatchNorm, dropout, a module
+        that is not known here, or a forward hook, such as that of ``torch.nn.utils.spectral_norm()``
     """
     return any(
         not type(module).__module__.startswith(_MODE_FREE_PACKAGES)

@@ -271,7 +271,7 @@ class LeanDiagGaussian(DiagGaussianDistribution):
         :return: Entropies, ``(batch_size,)``
         """
         if _is_torchs(self):
-            return super().entropy()
+            return sum_independent_dims(self.distribution.entropy())
         return sum_independent_dims(0.5 + 0.5 * math.log(2 * math.pi) + self._std.log())
 
     def sample(self) -> th.Tensor:

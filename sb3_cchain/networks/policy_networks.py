@@ -171,7 +171,7 @@ def has_mlps(policy: nn.Module) -> bool:
         extractors, and no hook looks at what is not called, nor was a method of it replaced
     """
     modules: dict[str, Any] = vars(policy)["_modules"]
-    mlp_extractor = modules.get("mlp_extractor")
+    mlp_extractor: Any = modules.get("mlp_extractor")
     return (
         _is_bare(mlp_extractor, MlpExtractor)
         and _is_bare(mlp_extractor._modules["policy_net"], nn.Sequential)
