@@ -602,3 +602,34 @@ def test_value_churn_is_the_mean_absolute_change(name):
     model.churn_reducer.backward = spy
     learn(model, 64)
     assert model.logger.name_to_value["churn/value_churn"] == pytest.approx(np.mean(seen), rel=1e-4)
+
+
+# --- Buffers of a user's own -----------------------------------------------------------------------------------------------
+
+
+def spoiling(buffer):
+    """Let a buffer overwrite each minibatch when it makes the next one, as one does that fills the same memory each time."""
+
+    class Spoiling(type(buffer)):
+        given = ()
+
+        def _get_samples(self, *args, **kwargs):
+            for tensor in self.given:
+                tensor.zero_()
+            samples = super()._get_samples(*args, **kwargs)
+            self.given = [leaf for leaf in th.utils._pytree.tree_leaves(samples) if th.is_tensor(leaf)]
+            return samples
+
+    buffer.__class__ = Spoiling
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO"])
+def test_a_buffer_may_fill_the_same_memory_for_each_minibatch(name):
+    models = []
+    for spoil in (False, True):
+        model = FAMILY[name].make(churn_target=FAMILY[name].targets[-1])
+        if spoil:
+            spoiling(getattr(model, "rollout_buffer", None) or model.replay_buffer)
+        models.append(learn(model, FEW_STEPS))
+    assert_equal(*models)
+    assert logged(models[0]) == logged(models[1])

@@ -7,6 +7,7 @@ import numpy as np
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_cchain.algorithms.own_memory import copied, is_shared
 from sb3_cchain.networks.policy_inputs import joined, n_observations, rows
 from sb3_cchain.replaced import replaced
 
@@ -25,7 +26,7 @@ def draw_epoch(
     :return: The minibatches that ``get(batch_size)`` gives
     """
     if not _is_sb3s(buffer, get):
-        minibatches = list(get(batch_size))
+        minibatches = [copied(minibatch) for minibatch in get(batch_size)]
         return HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         epoch = GatheredEpoch(buffer, list(get(batch_size)))
@@ -35,9 +36,14 @@ def draw_epoch(
 def _is_sb3s(buffer: RolloutBuffer, get: Callable[[int | None], Iterator[Any]]) -> bool:
     """Whether the buffer draws and gathers minibatches as SB3's do."""
     draws, gathers = (getattr(method, "__func__", None) for method in (get, buffer._get_samples))
-    return draws in (RolloutBuffer.get, DictRolloutBuffer.get) and gathers in (
-        RolloutBuffer._get_samples,
-        DictRolloutBuffer._get_samples,
+    return (
+        draws in (RolloutBuffer.get, DictRolloutBuffer.get)
+        and gathers
+        in (
+            RolloutBuffer._get_samples,
+            DictRolloutBuffer._get_samples,
+        )
+        and not is_shared(buffer.to_torch)
     )
 
 

@@ -7,6 +7,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.algorithms.epochs import draw_epoch
+from sb3_cchain.algorithms.own_memory import copied, is_shared
 
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
@@ -103,6 +104,7 @@ class ReferenceMinibatches:
 
     def __init__(self, buffer: RolloutBuffer):
         self._get = buffer.get
+        self._is_shared = is_shared(buffer.get, buffer._get_samples, buffer.to_torch)
         self._sample: Any = None
 
     def get(self, batch_size: int | None = None) -> Iterator[Any]:
@@ -110,7 +112,7 @@ class ReferenceMinibatches:
         :param batch_size: Minibatch size
         :return: The minibatches of one epoch
         """
-        minibatches = list(self._get(batch_size))
+        minibatches = [copied(each) if self._is_shared else each for each in self._get(batch_size)]
         for position, minibatch in enumerate(minibatches):
             self._sample = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)]
             yield minibatch
@@ -139,6 +141,7 @@ class PreviousRollout:
 
     def __init__(self, buffer: RolloutBuffer, previous: PyTorchObs | None):
         self._get = buffer.get
+        self._is_shared = is_shared(buffer.get, buffer._get_samples, buffer.to_torch)
         self._previous = previous
         # Observations of the rollout that is being trained on
         self.current: PyTorchObs | None = None
@@ -149,7 +152,7 @@ class PreviousRollout:
         :return: The minibatch
         """
         for minibatch in self._get(batch_size):
-            self.current = minibatch.observations
+            self.current = copied(minibatch.observations) if self._is_shared else minibatch.observations
             yield minibatch
 
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> PyTorchObs | None:
