@@ -396,7 +396,9 @@ def test_several_normalised_environments(member):
     assert any(key.startswith("churn_monitor/") for key in model.logger.name_to_value)
 
 
-@pytest.mark.parametrize("name", ["A2C", "TRPO", "SAC", "TQC", "CrossQ", "RecurrentPPO"])
+@pytest.mark.parametrize(
+    "name", ["A2C", "TRPO", "SAC", "TQC", "CrossQ", "RecurrentPPO", "DQN", "QRDQN", "SAC", "TD3", "TQC", "CrossQ"]
+)
 def test_gsde(name):
     member = FAMILY[name]
     model = learn(member.make(env=member.make_env(None, BOX), use_sde=True, churn_target=member.targets[-1]))
@@ -623,7 +625,9 @@ def spoiling(buffer):
     buffer.__class__ = Spoiling
 
 
-@pytest.mark.parametrize("name", ["PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO"])
+@pytest.mark.parametrize(
+    "name", ["PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO", "DQN", "QRDQN", "SAC", "TD3", "TQC", "CrossQ"]
+)
 def test_a_buffer_may_fill_the_same_memory_for_each_minibatch(name):
     models = []
     for spoil in (False, True):

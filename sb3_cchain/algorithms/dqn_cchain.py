@@ -9,7 +9,7 @@ from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
 from sb3_cchain.algorithms.q_network import QValues, finite_td_loss, joint_pass, log_q_churn
 from sb3_cchain.algorithms.reference_batches import REFERENCES
-from sb3_cchain.algorithms.replay_observations import sample_observations
+from sb3_cchain.algorithms.replay_observations import kept, sample_observations
 from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.evaluation_mode import evaluation_mode, has_training_mode
@@ -98,7 +98,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
         # Independent of the minibatch. It waits for the next update, which measures on it what this update changes
         assert self.replay_buffer is not None
-        next_minibatch = None
+        replay_data, next_minibatch = kept(self.replay_buffer, replay_data), None
         if self.churn_reference == "independent":
             reference = sample_observations(self.replay_buffer, batch_size, self._vec_normalize_env)
         else:
@@ -132,7 +132,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
             return self._next_minibatch, drawn
         self.churn_reducer.forget_reference()  # a saved model's: the minibatch that it belongs to is not saved
         assert self.replay_buffer is not None
-        return drawn, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        return drawn, kept(self.replay_buffer, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))
 
     def _all_q_values(self, replay_data: ReplayBufferSamples, reference: Observations) -> QValues:
         previous = self.churn_reducer.reference

@@ -11,7 +11,7 @@ import torch as th
 from sb3_cchain.algorithms.churn_log import churn_prefix, log_churn
 from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
 from sb3_cchain.algorithms.recorded import recorded
-from sb3_cchain.algorithms.replay_observations import sample_observations
+from sb3_cchain.algorithms.replay_observations import kept_minibatches, sample_observations
 from sb3_cchain.churn import ChurnReducer, extra_gradient
 from sb3_cchain.churn.divergence import mean_absolute_change
 from sb3_cchain.networks.compiled import uncompiled
@@ -44,6 +44,7 @@ def reduced_off_policy(model: Any, reducers: Mapping[str, ChurnReducer]) -> Iter
     changes: dict[str, list[float]] = {name: [] for name in reducers}
     coefs = {}
     with ExitStack() as stack:
+        stack.enter_context(kept_minibatches(model.replay_buffer))
         for name, reducer in reducers.items():
             reducer.discard_losses()  # of a training that was interrupted
             coefs[name] = reducer.coefficient.value

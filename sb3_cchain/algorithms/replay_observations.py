@@ -8,12 +8,51 @@ import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_cchain.algorithms.own_memory import copied, is_shared
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.replaced import replaced
 
 # How SB3's replay buffers draw transitions, and how they gather those that were drawn. HerReplayBuffer does otherwise
 _DRAWS = (ReplayBuffer.sample, DictReplayBuffer.sample)
 _GATHERS = (ReplayBuffer._get_samples, DictReplayBuffer._get_samples, NStepReplayBuffer._get_samples)
+
+
+class _CopyingSample:
+    """
+    Stands in for a buffer's ``sample()``, and copies what that gives.
+
+    :param buffer: The replay buffer
+    """
+
+    def __init__(self, buffer: ReplayBuffer):
+        self.sample = buffer.sample
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return copied(self.sample(*args, **kwargs))
+
+
+@contextmanager
+def kept_minibatches(buffer: ReplayBuffer) -> Iterator[None]:
+    """
+    Inside the ``with`` block a minibatch stays as it is when further transitions are drawn, also from a buffer that fills the
+    same memory each time.
+
+    :param buffer: The replay buffer
+    """
+    if _fills_memory_again(buffer):
+        with replaced(buffer, "sample", _CopyingSample(buffer)):
+            yield
+    else:
+        yield
+
+
+def kept(buffer: ReplayBuffer, minibatch: Any) -> Any:
+    """
+    :param buffer: A replay buffer
+    :param minibatch: What was just drawn from it
+    :return: The same, which stays as it is when further transitions are drawn
+    """
+    return copied(minibatch) if _fills_memory_again(buffer) else minibatch
 
 
 @contextmanager
@@ -45,9 +84,9 @@ def sample_observations(
     :param with_actions: Whether the actions are drawn, too
     :return: The observations; with actions ``observations`` and ``actions``
     """
-    if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS):
+    if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS) or is_shared(buffer.to_torch):
         with unchanged(buffer):
-            samples: Any = buffer.sample(batch_size, env=env)
+            samples: Any = kept(buffer, buffer.sample(batch_size, env=env))
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         indices: Any = buffer.sample(batch_size)
@@ -60,6 +99,10 @@ def sample_observations(
     else:
         observations = buffer.to_torch(normalized)
     return {"observations": observations, "actions": buffer.to_torch(buffer.actions[chosen])} if with_actions else observations
+
+
+def _fills_memory_again(buffer: ReplayBuffer) -> bool:
+    return is_shared(buffer.sample, buffer._get_samples, buffer.to_torch)
 
 
 def _is_overridden(method: Callable[..., Any], originals: tuple[Callable[..., Any], ...]) -> bool:
