@@ -170,3 +170,42 @@ def test_at_each_update_the_buffer_remembers_the_minibatch(callback):
     model.policy.optimizer.register_step_post_hook(after_update)
     model.learn(40, callback)
     assert len(remembers_minibatch) == model._n_updates > 0 and all(remembers_minibatch)
+
+
+class SlowBuffer(ReplayBuffer):
+    """While it is drawn from, another thread fills it."""
+
+    filled_by_another = None
+    n_added = 0
+
+    def add(self, *args):
+        super().add(*args)
+        self.n_added += 1
+
+    def sample(self, batch_size, env=None):
+        samples = super().sample(batch_size, env)
+        self.filled_by_another()
+        return samples
+
+
+def test_transitions_that_another_thread_adds_stay():
+    buffer, env = make_buffer("Box", n_steps=49)
+    buffer.__class__ = SlowBuffer
+    buffer.filled_by_another = lambda: fill(buffer, env, 2)
+    sample_observations(buffer, 8, None)
+    assert (buffer.pos, buffer.full, buffer.n_added) == (1, True, 2)
+
+
+def test_a_function_in_place_of_sample_leaves_the_buffer_as_it_is():
+    buffer, env = make_buffer("Box")
+    buffer.__class__ = RememberingBuffer
+    minibatch = buffer.sample(4)
+    last_drawn, sample = buffer.last_drawn, buffer.sample
+
+    def sample_while_filled(*args, **kwargs):
+        fill(buffer, env, 1)
+        return sample(*args, **kwargs)
+
+    buffer.sample = sample_while_filled
+    assert len(sample_observations(buffer, 8, None)) == 8
+    assert buffer.last_drawn is last_drawn and buffer.pos == 31 and len(minibatch.observations) == 4

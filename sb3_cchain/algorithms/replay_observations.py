@@ -26,6 +26,7 @@ class _CopyingSample:
 
     def __init__(self, buffer: ReplayBuffer):
         self.sample = buffer.sample
+        self.own_sample = vars(buffer).get("sample")  # set by the user on this object
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return copied(self.sample(*args, **kwargs))
@@ -56,19 +57,31 @@ def kept(buffer: ReplayBuffer, minibatch: Any) -> Any:
 
 
 @contextmanager
-def unchanged(buffer: ReplayBuffer) -> Iterator[None]:
+def aside(buffer: ReplayBuffer) -> Iterator[Any]:
     """
     Draw from the replay buffer of a model that is being trained, for other ends than training. What a buffer sets in itself
-    when it is drawn from, such as the indices whose priorities follow the losses, is put back afterwards.
+    when it is drawn from, such as the indices whose priorities follow the losses, is not set afterwards; what it changes in
+    place, such as the elements of an array, is changed. Another thread may fill the buffer meanwhile.
 
     :param buffer: The replay buffer
+    :return: What to draw from: a copy with the same transitions
     """
     before = dict(vars(buffer))
+    sample = before.pop("sample", None)
+    if isinstance(sample, _CopyingSample):
+        sample = sample.own_sample
+    if sample is None:
+        result: Any = object.__new__(type(buffer))  # copy() leaves out what is not pickled, such as HerReplayBuffer's `env`
+        vars(result).update(before)
+        yield result
+        return
+    # A function that was put on this very object draws from it, and not from a copy
     try:
-        yield
+        yield buffer
     finally:
-        vars(buffer).clear()
-        vars(buffer).update(before)
+        for name in vars(buffer).keys() - before.keys() - {"sample"}:
+            delattr(buffer, name)
+        vars(buffer).update({name: value for name, value in before.items() if name not in ("pos", "full")})
 
 
 def sample_observations(
@@ -85,8 +98,8 @@ def sample_observations(
     :return: The observations; with actions ``observations`` and ``actions``
     """
     if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS) or is_shared(buffer.to_torch):
-        with unchanged(buffer):
-            samples: Any = kept(buffer, buffer.sample(batch_size, env=env))
+        with aside(buffer) as drawn_from:
+            samples: Any = kept(buffer, drawn_from.sample(batch_size, env=env))
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         indices: Any = buffer.sample(batch_size)
