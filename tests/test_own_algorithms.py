@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, ContinualEnv, TrainingCheckpoint, resume
 from sb3_cchain.algorithms import ChurnAlgorithm
 from sb3_cchain.envs import CommonSpaces, TaskCaption
+from sb3_cchain.replaced import replaced
 from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
 from tests.envs import RandomEnv
 
@@ -33,6 +35,29 @@ class OwnLoop(PPO):
             self.policy.optimizer.step()
             self.logger.record_mean("train/policy_gradient_loss", loss.item())
         self.logger.record("train/entropy_loss", -entropy.mean().item())
+
+
+class InOrder(RolloutBuffer):
+    """Its ``get()`` takes one argument more."""
+
+    def get(self, batch_size=None, shuffle=True):
+        for minibatch in super().get(batch_size):
+            self.was_shuffled = shuffle
+            yield minibatch
+
+
+class InOrderLoop(PPO):
+    def train(self):
+        get = self.rollout_buffer.get
+        with replaced(self.rollout_buffer, "get", lambda batch_size: get(batch_size, shuffle=False)):
+            super().train()
+
+
+@pytest.mark.parametrize("churn_base_loss", ["actor", "last"])
+def test_an_own_buffer_takes_further_arguments(churn_base_loss):
+    settings = dict(PPO_SETTINGS, rollout_buffer_class=InOrder)
+    model = InOrderLoop("MlpPolicy", "CartPole-v1", **settings).learn(64, CChainCallback(churn_base_loss=churn_base_loss))
+    assert model.rollout_buffer.was_shuffled is False
 
 
 def test_an_own_train_is_trained_with_churn_reduction():

@@ -17,23 +17,25 @@ HELD_AT_MOST = 2**24
 
 
 def draw_epoch(
-    buffer: RolloutBuffer, get: Callable[[int | None], Iterator[Any]], batch_size: int
+    buffer: RolloutBuffer, get: Callable[..., Iterator[Any]], batch_size: int, *args: Any, **kwargs: Any
 ) -> "HeldEpoch | GatheredEpoch":
     """
     :param buffer: A rollout buffer
     :param get: Its own method ``get()``
     :param batch_size: Minibatch size
-    :return: The minibatches that ``get(batch_size)`` gives
+    :param args: Further arguments of ``get()``
+    :param kwargs: Further keyword arguments of ``get()``
+    :return: The minibatches that it gives
     """
     if not _is_sb3s(buffer, get):
-        minibatches = [copied(minibatch) for minibatch in get(batch_size)]
+        minibatches = [copied(minibatch) for minibatch in get(batch_size, *args, **kwargs)]
         return HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
-        epoch = GatheredEpoch(buffer, list(get(batch_size)))
+        epoch = GatheredEpoch(buffer, list(get(batch_size, *args, **kwargs)))
     return epoch.held() if _n_bytes(buffer.observations) <= HELD_AT_MOST else epoch
 
 
-def _is_sb3s(buffer: RolloutBuffer, get: Callable[[int | None], Iterator[Any]]) -> bool:
+def _is_sb3s(buffer: RolloutBuffer, get: Callable[..., Iterator[Any]]) -> bool:
     """Whether the buffer draws and gathers minibatches as SB3's do."""
     draws, gathers = (getattr(method, "__func__", None) for method in (get, buffer._get_samples))
     return (

@@ -26,9 +26,9 @@ def last_surrogate(model: PPO) -> Iterator[Callable[[], float]]:
     log_prob: Any = None
     of_update: tuple[Any, Any] = (None, None)
 
-    def watched_get(batch_size: int | None = None) -> Iterator[Any]:
+    def watched_get(*args: Any, **kwargs: Any) -> Iterator[Any]:
         nonlocal minibatch
-        for sample in get(batch_size):
+        for sample in get(*args, **kwargs):
             minibatch = sample
             yield sample
 

@@ -16,9 +16,11 @@ REFERENCES = ("independent", "next")
 class RolloutReferences(Protocol):
     """Stands in for ``rollout_buffer.get``, and has a reference batch for each minibatch of an epoch."""
 
-    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+    def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
         """
         :param batch_size: Minibatch size
+        :param args: Further arguments of the buffer's own method
+        :param kwargs: Further keyword arguments of the buffer's own method
         :return: The minibatches of one epoch
         """
         ...
@@ -59,16 +61,18 @@ class ReferenceBatches:
         self._kind = kind
         self._size = size
 
-    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+    def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
         """
         :param batch_size: Minibatch size
+        :param args: Further arguments of the buffer's own method
+        :param kwargs: Further keyword arguments of the buffer's own method
         :return: The minibatches of one epoch
         """
         self.current = None
         if batch_size is None:  # TRPO's policy, which no optimiser changes
-            yield from self._get(None)
+            yield from self._get(None, *args, **kwargs)
             return
-        epoch, size_before = draw_epoch(self._buffer, self._get, batch_size), 0
+        epoch, size_before = draw_epoch(self._buffer, self._get, batch_size, *args, **kwargs), 0
         for position, (start, size) in enumerate(self._places(epoch.sizes)):
             # With "next", the reference batch of the minibatch before begins with this minibatch
             self.n_shared = min(size_before, epoch.sizes[position]) if self._kind == "next" else 0
@@ -107,12 +111,14 @@ class ReferenceMinibatches:
         self._is_shared = is_shared(buffer.get, buffer._get_samples, buffer.to_torch)
         self._sample: Any = None
 
-    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+    def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
         """
         :param batch_size: Minibatch size
+        :param args: Further arguments of the buffer's own method
+        :param kwargs: Further keyword arguments of the buffer's own method
         :return: The minibatches of one epoch
         """
-        minibatches = [copied(each) if self._is_shared else each for each in self._get(batch_size)]
+        minibatches = [copied(each) if self._is_shared else each for each in self._get(batch_size, *args, **kwargs)]
         for position, minibatch in enumerate(minibatches):
             self._sample = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)]
             yield minibatch
@@ -146,12 +152,14 @@ class PreviousRollout:
         # Observations of the rollout that is being trained on
         self.current: PyTorchObs | None = None
 
-    def get(self, batch_size: int | None = None) -> Iterator[Any]:
+    def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
         """
         :param batch_size: Minibatch size
+        :param args: Further arguments of the buffer's own method
+        :param kwargs: Further keyword arguments of the buffer's own method
         :return: The minibatch
         """
-        for minibatch in self._get(batch_size):
+        for minibatch in self._get(batch_size, *args, **kwargs):
             self.current = copied(minibatch.observations) if self._is_shared else minibatch.observations
             yield minibatch
 
