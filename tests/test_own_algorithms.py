@@ -19,7 +19,7 @@ from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, CChainSAC, Continua
 from sb3_cchain.algorithms import ChurnAlgorithm
 from sb3_cchain.envs import CommonSpaces, TaskCaption
 from sb3_cchain.replaced import replaced
-from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS
+from tests.churn_models import DQN_SETTINGS, PPO_SETTINGS, assert_close
 from tests.envs import RandomEnv
 
 
@@ -121,6 +121,40 @@ def test_an_own_learn_keeps_its_arguments_and_its_name(base, args, name, tmp_pat
 
     model = Mine("MlpPolicy", RandomEnv(), tensorboard_log=str(tmp_path), **PPO_SETTINGS).learn(32, *args)
     assert Path(model.logger.dir).name == f"{name}_1"
+
+
+class ScaledLoop(PPO):
+    """Mixed precision, with the churn gradient scaled as the FAQ says."""
+
+    scale = 1.0
+
+    def train(self):
+        scaler = th.amp.GradScaler("cpu", init_scale=self.scale)
+        for data in self.rollout_buffer.get(self.batch_size):
+            _, log_prob, entropy = self.policy.evaluate_actions(data.observations, data.actions.long().flatten())
+            loss = -(data.advantages * th.exp(log_prob - data.old_log_prob)).mean()
+            self.policy.optimizer.zero_grad()
+            for parameter in self.policy.parameters():
+                if parameter.grad is not None:  # only the churn gradient so far
+                    parameter.grad *= scaler.get_scale()
+            scaler.scale(loss).backward()
+            scaler.unscale_(self.policy.optimizer)
+            scaler.step(self.policy.optimizer)
+            scaler.update()
+            self.logger.record_mean("train/policy_gradient_loss", loss.item())
+        self.logger.record("train/entropy_loss", -entropy.mean().item())
+
+
+def test_a_gradient_scaler():
+    models = []
+    for scale in (1.0, 65536.0):
+        models.append(ScaledLoop("MlpPolicy", "CartPole-v1", learning_rate=1e-3, **PPO_SETTINGS))
+        models[-1].scale = scale
+        models[-1].learn(64, CChainCallback(churn_coef=1e4))
+    assert_close(*models, atol=1e-6)
+    stock = ScaledLoop("MlpPolicy", "CartPole-v1", learning_rate=1e-3, **PPO_SETTINGS).learn(64)
+    with pytest.raises(AssertionError):
+        assert_close(models[0], stock, atol=1e-4)
 
 
 class Prefixed(Logger):
