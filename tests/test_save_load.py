@@ -273,6 +273,31 @@ def test_saved_again_by_a_stock_algorithm_the_history_is_kept(form, tmp_path):
 
 
 @each_form
+@pytest.mark.parametrize("as_saved", [False, True])
+def test_other_weights_are_no_churn(form, as_saved, tmp_path):
+    model = form.learn()
+    other = form.stock("MlpPolicy", RandomEnv(), **dict(form.settings, seed=1))
+    with th.no_grad():
+        for parameter in other.policy.parameters():
+            parameter.mul_(2)
+    model.policy.load_state_dict(other.policy.state_dict())
+    if as_saved:
+        model = save_and_load(model, tmp_path)
+    references = []
+
+    class Watch(BaseCallback):
+        def _on_training_start(self):
+            references.append(self.model.churn_state.reducers.first.reference)
+
+        def _on_step(self):
+            return True
+
+    _, callback = form.make()
+    model.learn(form.n_timesteps // 2, [*filter(None, [callback]), Watch()], reset_num_timesteps=False)
+    assert references == [None]
+
+
+@each_form
 def test_parameters_are_tensors_by_the_names_of_the_stock_algorithm(form):
     model = form.learn()
     parameters = model.get_parameters()

@@ -152,10 +152,12 @@ class CChainCallback(FiniteCheck):
 
     def _train(self, train: Callable[[], None]) -> None:
         self._hooks.remove()  # first, so that nothing is left when train() fails, too
+        self._state.weights = None
         with reduced_churn(self.model, self.churn_reducers, self._options):
             train()
         self._state.n_updates = self.model._n_updates
 
     def _on_training_end(self) -> None:
         self._hooks.remove()
+        self._state.keep_weights()
         super()._on_training_end()

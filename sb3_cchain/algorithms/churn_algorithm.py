@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback, TensorDict
 
-from sb3_cchain.algorithms.churn_state import keep_churn_state
+from sb3_cchain.algorithms.churn_state import ChurnState, keep_churn_state
 from sb3_cchain.algorithms.churn_targets import ChurnArguments, churn_kind
 from sb3_cchain.algorithms.finite_check import FiniteCheck
 from sb3_cchain.algorithms.full_signature import FullSignature
@@ -55,6 +55,7 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
     """
 
     churn_reducers: ChurnReducers
+    churn_state: ChurnState
 
     def __init__(
         self,
@@ -123,6 +124,7 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
         :param args: As of the base algorithm
         :param kwargs: As of the base algorithm
         """
+        self.churn_state.weights = None
         with reduced_churn(self, self.churn_reducers, self._churn_options()):
             super().train(*args, **kwargs)  # type: ignore[misc]
 
@@ -141,9 +143,16 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
             learn = super().learn
             if _has_sb3s_log_name(type(self), learn, n_given=1 + len(args)):
                 kwargs.setdefault("tb_log_name", type(self).__name__)
-            return learn(total_timesteps, *args, **kwargs)
+            learn = super().learn
+            if _has_sb3s_log_name(type(self), learn, n_given=1 + len(args)):
+                kwargs.setdefault("tb_log_name", type(self).__name__)
+            try:
+                return learn(total_timesteps, *args, **kwargs)
+            finally:
+                self.churn_state.keep_weights()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        self.churn_state.forget_if_changed()
         add_overview(self)  # to the logger that was just made
         callbacks = with_continual_callbacks([*as_list(callback), FiniteCheck()], self.env)
         return super()._init_callback(callbacks, progress_bar)

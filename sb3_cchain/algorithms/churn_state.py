@@ -1,5 +1,6 @@
 """Keeps the state of churn reduction with the model, so that it is saved and training goes on with the same λ."""
 
+import zlib
 from typing import Any
 from weakref import ref
 
@@ -7,6 +8,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cchain.churn import ChurnReducers
+from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.signal import TaskSwitch
 
 
@@ -28,6 +30,22 @@ class ChurnState:
         self.task_switch = task_switch
         # `model._n_updates` after the last training with churn reduction; None for models that always train with it
         self.n_updates: int | None = None
+        # Checksum of the weights that the last update left; None during training, whose weights are those at any moment
+        self.weights: int | None = None
+
+    def keep_weights(self) -> None:
+        """To be called when training ends: other weights later on are no churn."""
+        self.weights = self._checksum()
+
+    def forget_if_changed(self) -> None:
+        """To be called when training begins: forget the reference batches where the weights are others than it left."""
+        if self.weights not in (None, self._checksum()):
+            for reducer in self.reducers.values():
+                reducer.forget_reference()
+
+    def _checksum(self) -> int | None:
+        has_reference = any(reducer.reference is not None for reducer in self.reducers.values())
+        return weights_checksum(self.model) if has_reference else None
 
     @property
     def model(self) -> BaseAlgorithm:
@@ -47,6 +65,7 @@ class ChurnState:
             },
             "task_id": self.task_switch.task_id,
             "n_updates": self.model._n_updates if self.n_updates is None else self.n_updates,
+            "weights": self._checksum() if self.weights is None else self.weights,
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -60,8 +79,8 @@ def keep_churn_state(
     Let the reducers go on from a past state, and save their state with the model from now on.
 
     A reducer starts over when the past state has none for its target. λ starts over when the past one was of another kind or
-    had another window. The reference batch is forgotten when the model was trained without churn reduction in the meantime,
-    because what changed on it is not the churn of one update.
+    had another window. The reference batch is forgotten when the model was trained without churn reduction in the meantime, or
+    got other weights, because what changed on it is not the churn of one update.
 
     :param model: A model
     :param reducers: Its churn reducers, which are new, by the name of the target
@@ -83,7 +102,23 @@ def keep_churn_state(
             if past["n_updates"] != n_updates:
                 reducer.forget_reference()
     state = model.churn_state = ChurnState(model, reducers, task_switch)  # type: ignore[attr-defined]
+    state.weights = None if past is None else past.get("weights")
+    state.forget_if_changed()
     return state
+
+
+def weights_checksum(model: BaseAlgorithm) -> int:
+    """
+    :param model: A model
+    :return: A checksum of all that its optimisers train
+    """
+    checksum = 0
+    for optimizer in model_optimizers(model).values():
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                weights = parameter.detach().cpu().contiguous().reshape(-1).view(th.uint8)
+                checksum = zlib.crc32(weights.numpy(), checksum)
+    return checksum
 
 
 def _map_tensors(function: Any, state: Any) -> Any:

@@ -79,6 +79,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
         :param batch_size: Minibatch size
         :raises ValueError: When the loss is NaN or infinite. The parameters have not been updated.
         """
+        self.churn_state.weights = None
         DoubleDQN.train(self, gradient_steps, batch_size)
 
     def _excluded_save_params(self) -> list[str]:
