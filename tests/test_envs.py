@@ -2,6 +2,7 @@
 
 import pickle
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSync
+from sb3_cchain import CChainPPO, ContinualEnv, ContinualMetrics, TaskSignal, TaskSync
 from sb3_cchain.callbacks.default_callbacks import with_continual_callbacks
 from sb3_cchain.envs import ObservationOffset, RewardScale, TaskVecNormalize
 from sb3_cchain.envs.registration import CONTINUAL_ENVS
@@ -383,6 +384,105 @@ def test_a_task_sequence_is_equal_in_another_process_and_differs_with_the_tasks(
 def test_environments_side_by_side_must_agree(name, makers):
     with pytest.raises(ValueError, match=f"must have the same `{name}`, .* but environment 0 has .* and environment 1 has"):
         CChainPPO("MlpPolicy", DummyVecEnv(makers), **SETTINGS).learn(32)
+
+
+def two_carts(offset_seed=0, **kwargs):
+    """The first task is the same for each seed."""
+    return gym.make("Continual/CartPole-v1", **{"n_tasks": 2, "steps_per_task": 32, "offset_seed": offset_seed, **kwargs})
+
+
+def give(model, env, loaded, folder):
+    """The model, in another environment: by ``set_env()``, or loaded into it."""
+    if not loaded:
+        model.set_env(env)
+        return model
+    model.save(folder / "model")
+    return type(model).load(folder / "model", env=env, device="cpu")
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize(
+    "difference, message",
+    [
+        (dict(offset_seed=1), r"task 1 differs: \['CartPole-v1', \[.*\]\] instead of"),
+        (dict(n_tasks=1), "it has 1 tasks instead of 2"),
+        (dict(first_task=1), "its first task is 1 instead of 0"),
+        (dict(steps_per_task=[16, 48]), r"its tasks have \[16\] steps instead of \[32\]"),
+    ],
+)
+def test_training_does_not_go_on_in_another_task_sequence_unawares(loaded, difference, message, tmp_path):
+    model = CChainPPO("MlpPolicy", two_carts(), **SETTINGS).learn(64)
+    model = give(model, two_carts(**difference), loaded, tmp_path)
+    with pytest.raises(ValueError, match=f"{message}.*TaskSignal.* reset_num_timesteps=True"):
+        model.learn(16, reset_num_timesteps=False)
+    assert model.num_timesteps == 64
+    model.learn(16)
+    assert model.num_timesteps == 16 and model.trained_sequence["start"] == 0
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_another_task_sequence_begins_with_its_first_task_by_a_signal(loaded, tmp_path):
+    model = CChainPPO("MlpPolicy", two_carts(), **SETTINGS).learn(64, TaskSignal())
+    tasks = {}
+    # The last one has the same tasks and one more
+    for env in (two_carts(1), None, two_carts(1, n_tasks=3)):
+        if env is not None:
+            model = give(model, env, loaded, tmp_path)
+        record = RecordTasks()
+        model.learn(32, [TaskSignal(), record], reset_num_timesteps=False)
+        tasks |= record.tasks
+    assert [tasks[step] for step in (65, 96, 97, 128, 129, 160)] == [[0], [0], [1], [1], [2], [2]]
+    assert model.trained_sequence["start"] == 64
+    rows = {row["timesteps"]: row["task_id"] for row in model.continual_returns}
+    assert {rows[step] for step in rows if step <= 64} == {0, 1} and {rows[step] for step in rows if step > 64} == {2, 3, 4}
+    with pytest.raises(ValueError, match="it began at step 64, after another one"):
+        model.learn(16, reset_num_timesteps=False)
+    model.learn(16)
+    assert model.trained_sequence["start"] == 0
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize(
+    "further, n_steps, task",
+    [
+        *((dict(), 32, 1), (dict(n_tasks=4), 64, 2), (dict(n_tasks=4), 48, 1)),
+        # What has not been trained in yet may be another task
+        *((dict(offset_seed=1), 32, 1), (dict(steps_per_task=[32, 64]), 64, 1), (dict(steps_per_task=64), 16, 0)),
+    ],
+)
+def test_the_same_sequence_and_a_longer_one_go_on_at_their_step(loaded, further, n_steps, task, tmp_path):
+    model, record = CChainPPO("MlpPolicy", two_carts(), **SETTINGS).learn(n_steps), RecordTasks()
+    give(model, two_carts(**further), loaded, tmp_path).learn(16, record, reset_num_timesteps=False)
+    assert [record.tasks[step] for step in (n_steps + 1, n_steps + 16)] == [[task]] * 2
+
+
+def test_what_follows_another_task_sequence_knows_its_time():
+    model = PPO("MlpPolicy", two_carts(), **SETTINGS).learn(64, TaskSync())
+    model.set_env(two_carts(1))
+    model.learn(16, [TaskSync(), TaskSignal()], reset_num_timesteps=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(16, [TaskSignal(), ContinualMetrics()], reset_num_timesteps=False)
+    model.set_env(two_carts(1))
+    with pytest.warns(UserWarning, match="are at step 0, but training is at step 32"):
+        model.learn(16, [TaskSignal(), ContinualMetrics()], reset_num_timesteps=False)
+
+
+def test_arrays_that_describe_tasks_are_compared(tmp_path):
+    class Described(ContinualEnv):
+        goal = 1.0
+
+        @property
+        def task_sequence(self):
+            return [("reach", np.array([self.goal, 0.5])), ("reach", np.float32(2.5))]
+
+    model = CChainPPO("MlpPolicy", Described([CountEnv] * 2, 32), **SETTINGS).learn(16)
+    same, other = (Described([CountEnv] * 2, 32) for _ in range(2))
+    other.goal = 2.0
+    model = give(model, same, True, tmp_path).learn(16, reset_num_timesteps=False)
+    model.set_env(other)
+    with pytest.raises(ValueError, match=r"task 0 differs: \['reach', \[2.0, 0.5\]\] instead of"):
+        model.learn(16, reset_num_timesteps=False)
 
 
 class HasTaskId(RandomEnv):

@@ -15,7 +15,7 @@ from stable_baselines3.common.save_util import save_to_zip_file
 
 import sb3_cchain.zoo.__main__
 import sb3_cchain.zoo.inspect
-from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSync
+from sb3_cchain import CChainCallback, CChainDQN, CChainPPO, ContinualMetrics, DoubleDQN, TaskSignal, TaskSync
 from sb3_cchain.analysis import EvalAllTasks, EvalTrainedTask, NetworkHealth
 from sb3_cchain.analysis.inspection import inspect_model
 from sb3_cchain.analysis.inspection_report import report
@@ -124,8 +124,23 @@ def test_task_of_a_continual_environment(algorithm, tmp_path, monkeypatch, capsy
         assert message in capsys.readouterr().err
 
 
-def make_continual_env():
-    return make_vec_env("Continual/CartPole-v1", env_kwargs=dict(n_tasks=3, steps_per_task=32))
+def make_continual_env(**kwargs):
+    return make_vec_env("Continual/CartPole-v1", env_kwargs={"n_tasks": 3, "steps_per_task": 32, **kwargs})
+
+
+@pytest.mark.parametrize("algorithm", [PPO, CChainPPO])
+def test_a_model_of_two_task_sequences(algorithm):
+    model = make(algorithm, make_continual_env()).learn(64, [TaskSync(), TaskSignal()])
+    model.set_env(make_continual_env(offset_seed=1, n_tasks=4))
+    model.learn(32, [TaskSync(), TaskSignal()], reset_num_timesteps=False)
+    sequence = model.trained_sequence
+    inspect_model(model)
+    # 64 steps after the beginning of the second one
+    assert model.env.get_attr("task_id") == [2] and model.trained_sequence == sequence
+    # In other tasks than it was trained in
+    model.set_env(make_continual_env(offset_seed=2))
+    inspect_model(model)
+    assert model.trained_sequence == sequence
 
 
 @pytest.mark.parametrize(

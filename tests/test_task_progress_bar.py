@@ -193,3 +193,11 @@ def test_a_log_file_gets_the_end_alone(bar, capsys):
     first, second = capsys.readouterr().out.splitlines()
     assert first == "task 1 (2 of 3) count two, next in 16 steps (0:00:00), return 14"
     assert second.startswith("100% ━") and " 48/48 " in second
+
+
+def test_the_next_switch_in_another_task_sequence(bar):
+    model = make(make_env()).learn(96, TaskSync())
+    model.set_env(make_vec_env(lambda: ContinualEnv([CountEnv] * 2, 32)))
+    look = Look(bar, 100)
+    model.learn(64, [TaskSync(), TaskSignal(), bar, look], reset_num_timesteps=False)
+    assert "next in 28 steps" in look.seen[100][0]

@@ -29,7 +29,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TrainingCheckpoint, resume
+from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TaskSignal, TrainingCheckpoint, resume
 from sb3_cchain.checkpoint import ResumableEnv, checkpoint_folder, find_checkpoint, load_model, training_checkpoint
 from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
 from sb3_cchain.envs import TaskVecNormalize
@@ -1345,3 +1345,17 @@ def test_resume_from_keeps_the_settings(tmp_path):
     make().learn(32, TrainingCheckpoint(16, tmp_path, keep=5, exact=False))
     found = TrainingCheckpoint.resume_from(find_checkpoint(tmp_path))
     assert (found.save_freq, found.keep, found.exact) == (16, 5, False)
+
+
+def test_the_second_task_sequence_of_a_training_goes_on(tmp_path):
+    def make(offset_seed):
+        return gym.make("Continual/CartPole-v1", n_tasks=2, steps_per_task=32, offset_seed=offset_seed)
+
+    model = CChainPPO("MlpPolicy", make(0), n_steps=16, batch_size=8, device="cpu", seed=0).learn(64, TaskSignal())
+    model.set_env(make(1))
+    model.learn(64, [TaskSignal(), TrainingCheckpoint(32, tmp_path)], reset_num_timesteps=False)
+    resumed = resume(tmp_path, make(1), TaskSignal())
+    assert resumed.continual_returns == model.continual_returns
+    assert {row["task_id"] for row in resumed.continual_returns} == {0, 1, 2, 3}
+    with pytest.raises(ValueError, match="The training that was saved differs from this one: environment was"):
+        resume(tmp_path, make(2), TaskSignal())

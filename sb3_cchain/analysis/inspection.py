@@ -26,8 +26,9 @@ from sb3_cchain.callbacks import ContinualMetrics, TaskLearningStarts
 from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.replaced import replaced
-from sb3_cchain.tasks import TaskSync
+from sb3_cchain.tasks import TaskSignal, TaskSync
 from sb3_cchain.tasks.continual import is_continual
+from sb3_cchain.tasks.sequence import other_sequence, sequence_start
 from sb3_cchain.validation import check_number
 
 _MONITORS = (ChurnMonitor, Doctor, NetworkHealth, NTKCallback)
@@ -134,6 +135,8 @@ def _one_iteration(model: OnPolicyAlgorithm | OffPolicyAlgorithm, n_steps: int, 
         settings["gradient_steps"] = n_updates
     # All episodes of this rollout, and no others
     settings |= {"ep_info_buffer": None, "ep_success_buffer": None, "_stats_window_size": n_steps}
+    if model.env is not None and is_continual(model.env) and other_sequence(model, model.env) is not None:
+        settings["trained_sequence"] = None  # the user's choice of other tasks is no training that goes on in them
     with ExitStack() as stack:
         for name, value in settings.items():
             stack.enter_context(replaced(model, name, value))
@@ -181,6 +184,8 @@ def _kept_callbacks(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> 
     kept = [callback for callback in callbacks if not isinstance(callback, (*_MONITORS, *_WRITERS, TaskLearningStarts))]
     if is_continual(model.env) and not any(isinstance(callback, TaskSync) for callback in kept):
         kept.insert(0, TaskSync())
+    if sequence_start(model) > 0 and not any(isinstance(callback, TaskSignal) for callback in kept):
+        kept.insert(1, TaskSignal())
     return kept
 
 

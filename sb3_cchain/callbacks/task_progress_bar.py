@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cchain.callbacks.learn_call import LearnCall
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
+from sb3_cchain.tasks.sequence import sequence_start
 from sb3_cchain.tasks.signal import TaskSwitch, active_signal, told_task
 
 SECONDS_BETWEEN_DRAWINGS = 0.25
@@ -191,7 +192,8 @@ class TaskProgressBar(BaseCallback):
         signal = active_signal(self.training_env)
         if signal is not None and signal.next_switch is not None:
             return signal.next_switch
-        return next((step for step in self._switches if step > self.model.num_timesteps), None)
+        start = sequence_start(self.model)
+        return next((start + step for step in self._switches if start + step > self.model.num_timesteps), None)
 
 
 def as_clock(seconds: float | None) -> str:

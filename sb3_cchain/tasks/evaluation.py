@@ -7,6 +7,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 from sb3_cchain.tasks.continual import is_continual
+from sb3_cchain.tasks.sequence import differing_task
 from sb3_cchain.tasks.single_envs import share_envs
 
 
@@ -51,14 +52,9 @@ def check_same_tasks(env: VecEnv, eval_env: VecEnv) -> None:
     :raises ValueError: When their tasks differ
     """
     tasks, eval_tasks = (an_env.get_attr("task_sequence", indices=0)[0] for an_env in (env, eval_env))
-    if tasks == eval_tasks:
-        return
-    if len(tasks) != len(eval_tasks):
-        difference = f"it has {len(eval_tasks)} tasks instead of {len(tasks)}"
-    else:
-        position = next(i for i, (task, eval_task) in enumerate(zip(tasks, eval_tasks, strict=True)) if task != eval_task)
-        difference = f"task {position} differs: {eval_tasks[position]} instead of {tasks[position]}"
-    raise ValueError(
-        f"The evaluation environment must have the tasks of the training environment, but {difference}. Make both with the "
-        "same arguments (RL Zoo: give them as --env-kwargs, or repeat those of the YAML file as --eval-env-kwargs)."
-    )
+    difference = differing_task(tasks, eval_tasks)
+    if difference is not None:
+        raise ValueError(
+            f"The evaluation environment must have the tasks of the training environment, but {difference}. Make both with "
+            "the same arguments (RL Zoo: give them as --env-kwargs, or repeat those of the YAML file as --eval-env-kwargs)."
+        )

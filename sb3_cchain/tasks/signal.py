@@ -166,6 +166,15 @@ def count_before_step(model: BaseAlgorithm) -> int:
     return count if step == model.num_timesteps else task_count(model)
 
 
+def count_other_sequence(model: BaseAlgorithm) -> None:
+    """
+    :param model: A model whose environment has another task sequence than before, which :func:`task_count` then has counted,
+        also where the model was loaded in the meantime
+    """
+    if not has_other_env(model):
+        _count_one_more(model)
+
+
 def has_other_env(model: BaseAlgorithm) -> bool:
     """
     :param model: A model during ``learn()``
