@@ -4,6 +4,7 @@ import builtins
 import warnings
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -696,4 +697,28 @@ def test_what_was_heard_before_the_first_signal_is_not_heard_again():
     task_switched(model)
     model.learn(16, ContinualMetrics(), reset_num_timesteps=False)
     model.learn(16, signal, reset_num_timesteps=False)
+    assert signal.next_task == 1  # as the metrics have it
+    model.learn(16, signal)
     assert signal.next_task == 0
+
+
+@pytest.mark.parametrize("saved", [False, True])
+@pytest.mark.parametrize(
+    "n_steps, offset_seed, expected",
+    [(64, 0, {1}), (64, 1, {2, 3}), (32, 0, {1}), (16, 0, {0, 1})],
+)
+def test_a_signal_that_comes_later_goes_on_with_the_numbers_of_the_metrics(n_steps, offset_seed, expected, saved, tmp_path):
+    def make(offset_seed):
+        return gym.make("Continual/CartPole-v1", n_tasks=2, steps_per_task=32, offset_seed=offset_seed)
+
+    model = make_model("CChainPPO", make(0)).learn(n_steps, Oracle())
+    if saved:
+        model.save(tmp_path / "model")
+        model = type(model).load(tmp_path / "model", env=make(offset_seed), device="cpu")
+    elif offset_seed:
+        model.set_env(make(offset_seed))
+    oracle = Oracle()
+    model.learn(48, [TaskSignal(), oracle], reset_num_timesteps=False)
+    assert {row["task_id"] for row in model.continual_returns if row["timesteps"] > n_steps} == expected
+    before = (n_steps - 1) // 32
+    assert oracle.n_resets == len(expected | {before}) - 1

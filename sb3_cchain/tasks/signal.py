@@ -10,6 +10,7 @@ order, and the first that knows the task decides:
 3. The model's count of the environments that ``set_env()`` gave and of the calls of :func:`task_switched`.
 """
 
+from numbers import Integral
 from typing import Any
 from weakref import WeakKeyDictionary, ref
 
@@ -173,6 +174,18 @@ def count_other_sequence(model: BaseAlgorithm) -> None:
     """
     if not has_other_env(model):
         _count_one_more(model)
+
+
+def known_numbers(model: BaseAlgorithm) -> list[int]:
+    """
+    :param model: A model when training starts
+    :return: The numbers of the task, as the listeners that keep it with the model last heard them; none at step 0
+    """
+    if model.num_timesteps == 0:
+        return []
+    state = getattr(model, "continual_state", None) or {}
+    known = [state.get("task_id"), *(getattr(model, name, None) for name in ("trained_task_id", "learning_starts_task_id"))]
+    return [int(task) for task in known if isinstance(task, Integral)]
 
 
 def has_other_env(model: BaseAlgorithm) -> bool:

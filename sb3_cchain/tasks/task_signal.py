@@ -17,6 +17,7 @@ from sb3_cchain.tasks.signal import (
     episode_goes_on,
     first_reset_info,
     has_other_env,
+    known_numbers,
     register_signal,
     remember_episode,
     task_count,
@@ -51,7 +52,8 @@ class TaskSignal(BaseCallback):
       over with the next rollout, when the methods have acted.
 
     The state is kept with the model, as ``model.task_signal``: a saved model that is trained further goes on counting, and
-    hears of a change in the meantime. The detector starts over then, except where training is resumed exactly, from a
+    hears of a change in the meantime. A model that was trained without a TaskSignal goes on with the last number that other
+    callbacks know. The detector starts over then, except where training is resumed exactly, from a
     :class:`~sb3_cchain.TrainingCheckpoint`.
 
     :param key: Key of the info that holds the task
@@ -139,13 +141,19 @@ class TaskSignal(BaseCallback):
         register_signal(self)
         task_count(self.model)  # set_env() may have given another environment
         if self.num_timesteps == 0 or not hasattr(self.model, "task_signal"):
-            # The model may have been trained without this callback, and the task have switched since its last step
-            reports = {"count": count_before_step(self.model)}
-            self.model.task_signal = {"task": 0, "reports": reports}  # type: ignore[attr-defined]
+            self.model.task_signal = self._first_state()  # type: ignore[attr-defined]
         # In an episode that goes on, steps have told more than the info that it began with
         began = {} if episode_goes_on(self.model) else first_reset_info(self.training_env)
         self._hear(self._in_info(began), self._between_steps())
         self._step_task = self.next_task
+
+    def _first_state(self) -> dict[str, Any]:
+        """The model may have been trained without this callback, and the task have switched since its last step."""
+        count, numbers = count_before_step(self.model), known_numbers(self.model)
+        reports: dict[str, Any] = {"count": count}
+        if numbers and self._has_default_source:
+            reports["info"] = max(numbers)  # where the environment numbers its tasks
+        return {"task": max([count, *numbers]), "reports": reports}
 
     def _on_rollout_start(self) -> None:
         self._hear(self._between_steps())
