@@ -299,6 +299,38 @@ def test_the_user_does_not_contradict_the_environment():
         task_switched(model)
 
 
+class HalfTold(World):
+    """Has its tasks in the infos of steps, and of resets if wanted."""
+
+    in_reset = False
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0], {"task_id": int(self.level == "hard")} if self.in_reset else {}
+
+    def step(self, action):
+        task_id = int(self.level == "hard")
+        return *super().step(action)[:4], {"task_id": task_id}
+
+
+@pytest.mark.parametrize("follower", ["Oracle", "TaskLearningStarts", "TaskVecNormalize"])
+@pytest.mark.parametrize("in_reset, signals", [(False, []), (True, []), (False, [TaskSignal])])
+def test_a_task_that_is_told_in_steps_alone_is_warned_of(follower, in_reset, signals):
+    world = HalfTold()
+    world.in_reset = in_reset
+    env = make_vec_env(lambda: world)
+    callbacks = [make() for make in signals] + [ContinualMetrics()]
+    callbacks += {"Oracle": [Oracle()], "TaskLearningStarts": [TaskLearningStarts(8)], "TaskVecNormalize": []}[follower]
+    algorithm = "DQN" if follower == "TaskLearningStarts" else "PPO"
+    model = make_model(algorithm, TaskVecNormalize(env) if follower == "TaskVecNormalize" else env)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            model.learn(32, callbacks, reset_num_timesteps=False)
+    n_warnings = sum("infos of step(), but not in those of reset()" in str(warning.message) for warning in caught)
+    assert n_warnings == (not in_reset and not signals)
+    assert model.continual_state["n_switches"] == 1
+
+
 def test_two_reports_at_a_step_are_one_switch():
     """The call, another environment, and an attribute that differs there."""
     worlds, metrics = [World(), World()], ContinualMetrics()

@@ -7,7 +7,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cchain.tasks.callback_tree import will_be_restored
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, step_task, warn_of_half_told_tasks
 from sb3_cchain.validation import check_number
 
 
@@ -49,6 +49,7 @@ class TaskLearningStarts(BaseCallback):
             self._listen(episode_task(self.model))
 
     def _on_step(self) -> bool:
+        warn_of_half_told_tasks(self.training_env, self.locals["infos"][0])
         if self._switch.task_id is None:
             self._listen(step_task(self.model, self.locals["infos"]))
         self._listen(episode_task(self.model))

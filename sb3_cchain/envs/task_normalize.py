@@ -9,7 +9,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
-from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
+from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info, warn_of_half_told_tasks
 from sb3_cchain.validation import check_bool
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
@@ -24,7 +24,8 @@ class TaskVecNormalize(VecNormalize):
     and are normalised with its statistics. The observation that comes with that step is already the first of the next task,
     and the first in the new statistics.
 
-    It reads the task from ``task_id`` in the infos of the first environment; environments side by side switch together.
+    It reads the task from ``task_id`` in the infos of the first environment's resets; environments side by side switch
+    together.
     With a :class:`~sb3_cchain.TaskSignal` in ``learn()``, it restarts where that says, from the step after its word on.
     Without either, while the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With
     ``training=False`` statistics are neither updated nor restarted, so that an evaluation environment has the statistics of
@@ -101,6 +102,8 @@ class TaskVecNormalize(VecNormalize):
         rewards = self.normalize_reward(rewards)
         # At a switch the statistics restart between the old task's values and the new task's, which VecNormalize's own
         # method has no place for
+        if self._follows_tasks():
+            warn_of_half_told_tasks(self.venv, infos[0])
         switch = self._enters_task()
         if switch:
             self._normalize_terminal(dones, infos)

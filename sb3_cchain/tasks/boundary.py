@@ -5,7 +5,7 @@ from abc import abstractmethod
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cchain.tasks.listening import start_listening
-from sb3_cchain.tasks.signal import TaskSwitch, episode_task
+from sb3_cchain.tasks.signal import TaskSwitch, episode_task, warn_of_half_told_tasks
 
 
 class TaskBoundary(BaseCallback):
@@ -36,6 +36,8 @@ class TaskBoundary(BaseCallback):
         self._switch = TaskSwitch(known)
 
     def _on_rollout_start(self) -> None:
+        if "infos" in self.locals:  # those of the rollout before
+            warn_of_half_told_tasks(self.training_env, self.locals["infos"][0])
         switched = self._switch.happened(episode_task(self.model))
         self.model.trained_task_id = self._switch.task_id  # type: ignore[attr-defined]
         if switched:

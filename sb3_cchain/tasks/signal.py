@@ -6,13 +6,15 @@ present task, as :func:`step_task` (after a step) or :func:`episode_task` (befor
 order, and the first that knows the task decides:
 
 1. The :class:`~sb3_cchain.TaskSignal` that ``learn()`` was given, which counts the switches that its source reports.
-2. The environment, where it numbers its tasks in ``info["task_id"]``, as :class:`~sb3_cchain.ContinualEnv` does.
+2. The environment, where it numbers its tasks in ``info["task_id"]`` of steps and resets, as
+   :class:`~sb3_cchain.ContinualEnv` does.
 3. The model's count of the environments that ``set_env()`` gave and of the calls of :func:`task_switched`.
 """
 
+import warnings
 from numbers import Integral
 from typing import Any
-from weakref import WeakKeyDictionary, ref
+from weakref import WeakKeyDictionary, WeakSet, ref
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -91,6 +93,28 @@ def first_reset_info(env: VecEnv) -> dict[str, Any]:
     :return: The info with which the present episode of its first environment began; environments side by side switch together
     """
     return env.unwrapped.reset_infos[0]
+
+
+# Environments that were warned of
+_half_told: WeakSet[VecEnv] = WeakSet()
+
+
+def warn_of_half_told_tasks(env: VecEnv, info: dict[str, Any]) -> None:
+    """
+    Warn, once, when an environment numbers its tasks in the infos of steps, but not in those of resets, which
+    :func:`episode_task` reads, and there is no :class:`~sb3_cchain.TaskSignal`.
+
+    :param env: A vectorised environment
+    :param info: The info of its first environment's last step
+    """
+    if TASK_KEY not in info or TASK_KEY in first_reset_info(env) or env.unwrapped in _half_told:
+        return
+    if active_signal(env) is None:
+        _half_told.add(env.unwrapped)
+        warnings.warn(
+            f"The environment has {TASK_KEY!r} in the infos of step(), but not in those of reset(), so that not all that "
+            "follows the tasks hears of a switch. Let reset() return it, too, or give `learn()` a TaskSignal."
+        )
 
 
 # The info with which the episode of each model's last step began
