@@ -157,7 +157,9 @@ def _look_while_training(
     try:
         # Schedules keep their present values instead of going to their ends
         with replaced(model, "_update_current_progress_remaining", lambda *_: None):
-            callback = [*_kept_callbacks(model, callbacks), *monitors]
+            kept = _kept_callbacks(model, callbacks)
+            changing = [each for each in kept if getattr(each, "changes_network", False)]
+            callback = [*(each for each in kept if each not in changing), *monitors, *changing]
             model.learn(n_steps, callback=callback, log_interval=_NEVER, reset_num_timesteps=False)
     except ValueError:
         if is_finite(model):
