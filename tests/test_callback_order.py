@@ -48,7 +48,7 @@ def test_what_changes_the_network_in_updates_may_come_first():
     learn([ShrinkAndPerturb(interval=1), ChurnMonitor()])
 
 
-@pytest.mark.parametrize("name", ["ContinualBackprop", "ReDo", "FIRE", "LayerReset", "ShrinkAndPerturb"])
+@pytest.mark.parametrize("name", ["ContinualBackprop", "ReDo", "ReGraMa", "SelfNormalizedResets", "ShrinkAndPerturb"])
 def test_a_method_that_would_act_twice_is_refused(name):
     from sb3_cchain import methods
 

@@ -420,6 +420,24 @@ def test_training_does_not_go_on_in_another_task_sequence_unawares(loaded, diffe
     assert model.num_timesteps == 16 and model.trained_sequence["start"] == 0
 
 
+class DescribedEnv(ContinualEnv):
+    """Describes its tasks by what a saved model would bring back otherwise, or what is not equal to itself."""
+
+    @property
+    def task_sequence(self):
+        return [{1: np.ones(2), "pair": (1, 2), "gap": float("nan")}] * self.n_tasks
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_the_same_task_sequence_however_it_is_described(loaded, tmp_path):
+    def make_env():
+        return DescribedEnv([CountEnv] * 2, 32)
+
+    model = CChainPPO("MlpPolicy", make_env(), **SETTINGS).learn(48)
+    model = give(model, make_env(), loaded, tmp_path)
+    assert model.learn(16, reset_num_timesteps=False).num_timesteps == 64
+
+
 @pytest.mark.parametrize("loaded", [False, True])
 def test_another_task_sequence_begins_with_its_first_task_by_a_signal(loaded, tmp_path):
     model = CChainPPO("MlpPolicy", two_carts(), **SETTINGS).learn(64, TaskSignal())

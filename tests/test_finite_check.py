@@ -142,6 +142,12 @@ def test_nan_that_the_extractor_takes_for_a_missing_value(form, at):
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
+def test_nan_that_would_stay_in_the_statistics():
+    env = VecNormalize(vectorise(FaultyEnv("observation", 7)))
+    with pytest.raises(ValueError, match=r"observation at step 7 .* it holds nan"):
+        CChainPPO("MlpPolicy", env, n_steps=16, batch_size=8, policy_kwargs=FILLS_IN, device="cpu").learn(64)
+
+
 @each_form
 def test_infinite_values_that_the_extractor_takes(form):
     """Nobody says a missing value by them."""

@@ -4,6 +4,7 @@ import pytest
 from gymnasium import spaces
 from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from torch import nn
 
 from sb3_cchain.methods import Muon, NormalizeAndProject, OptimizerMetrics, Parseval, SpectralRegularization, WeightClipping
 from sb3_cchain.methods.output_layers import check_output_layers
@@ -69,6 +70,13 @@ def test_a_number_of_output_layers_that_does_not_fit_is_refused(optimizer_class,
     ):
         model.learn(10, callback=OptimizerMetrics())
     assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("head", [nn.Sequential(), nn.MultiheadAttention(8, 2)])
+def test_heads_that_are_not_known_are_passed_over(head):
+    model = with_matrices(Parseval, PPO)
+    model.policy.action_net = head
+    check_output_layers(model)
 
 
 def test_muon_leaves_matrices_of_one_row_alone_anyway():

@@ -1,7 +1,6 @@
 """The mixin that wires churn reduction into a Stable-Baselines3 algorithm."""
 
-from collections.abc import Callable
-from inspect import signature
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch as th
@@ -140,14 +139,10 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
                 base algorithm's own ``learn()`` has another default than SB3's.
             :return: The trained model
             """
-            learn = super().learn
-            if _has_sb3s_log_name(type(self), learn, n_given=1 + len(args)):
-                kwargs.setdefault("tb_log_name", type(self).__name__)
-            learn = super().learn
-            if _has_sb3s_log_name(type(self), learn, n_given=1 + len(args)):
+            if _takes_sb3s_log_name(type(self), n_given=1 + len(args)):
                 kwargs.setdefault("tb_log_name", type(self).__name__)
             try:
-                return learn(total_timesteps, *args, **kwargs)
+                return super().learn(total_timesteps, *args, **kwargs)
             finally:
                 self.churn_state.keep_weights()
 
@@ -201,11 +196,17 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
         keep_churn_state(self, self.churn_reducers, self._task_switch, past, n_updates)
 
 
-def _has_sb3s_log_name(algorithm: type, learn: Callable[..., Any], n_given: int) -> bool:
+def _takes_sb3s_log_name(algorithm: type, n_given: int) -> bool:
     """Whether ``tb_log_name`` is not among the first arguments, which are given, and SB3's: the name of its class."""
-    later = list(signature(learn).parameters.values())[n_given:]
-    default = next((parameter.default for parameter in later if parameter.name == "tb_log_name"), None)
-    stock = (
-        base for base in algorithm.__mro__ if base.__module__.startswith(("stable_baselines3.", "sb3_contrib.", "sb3_cchain."))
-    )
-    return default in [base.__name__ for base in stock]
+    bases = algorithm.__mro__[algorithm.__mro__.index(ChurnAlgorithm) + 1 :]
+    stock = [
+        base.__name__ for base in bases if base.__module__.startswith(("stable_baselines3.", "sb3_contrib.", "sb3_cchain."))
+    ]
+    for learn in (vars(base)["learn"] for base in bases if "learn" in vars(base)):
+        _, *parameters = signature(learn).parameters.values()
+        position = next((i for i, parameter in enumerate(parameters) if parameter.name == "tb_log_name"), None)
+        if position is not None:
+            return n_given <= position and parameters[position].default in stock
+        if parameters[-1].kind is not Parameter.VAR_KEYWORD:  # not passed on to the next one
+            return False
+    return False

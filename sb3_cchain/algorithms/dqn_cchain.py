@@ -13,7 +13,6 @@ from sb3_cchain.algorithms.replay_observations import kept, sample_observations
 from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.evaluation_mode import evaluation_mode, has_training_mode
-from sb3_cchain.networks.policy_networks import is_instrumented
 from sb3_cchain.validation import check_choice
 
 
@@ -137,7 +136,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
     def _all_q_values(self, replay_data: ReplayBufferSamples, reference: Observations) -> QValues:
         previous = self.churn_reducer.reference
-        if not has_training_mode(self.q_net) and not is_instrumented(self.q_net):
+        if not has_training_mode(self.q_net):
             if self.churn_reference == "next" and previous is not None:
                 # It is this minibatch, whose values are computed anyway
                 values = joint_pass(self.q_net, replay_data, reference, None, self.double_q)

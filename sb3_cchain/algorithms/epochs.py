@@ -37,15 +37,11 @@ def draw_epoch(
 
 def _is_sb3s(buffer: RolloutBuffer, get: Callable[..., Iterator[Any]]) -> bool:
     """Whether the buffer draws and gathers minibatches as SB3's do."""
-    draws, gathers = (getattr(method, "__func__", None) for method in (get, buffer._get_samples))
+    gathers = getattr(getattr(buffer, "_get_samples", None), "__func__", None)
     return (
-        draws in (RolloutBuffer.get, DictRolloutBuffer.get)
-        and gathers
-        in (
-            RolloutBuffer._get_samples,
-            DictRolloutBuffer._get_samples,
-        )
-        and not is_shared(buffer.to_torch)
+        getattr(get, "__func__", None) in (RolloutBuffer.get, DictRolloutBuffer.get)
+        and gathers in (RolloutBuffer._get_samples, DictRolloutBuffer._get_samples)
+        and not is_shared(buffer, "to_torch")
     )
 
 

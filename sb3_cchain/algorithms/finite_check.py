@@ -77,7 +77,7 @@ class FiniteCheck(BaseCallback):
             )
 
     def _check_observations(self, observations: Any, index: int | None = None) -> None:
-        takes_nan = partial(_takes_nan, self.model.policy, observations)
+        takes_nan = partial(_takes_nan, self.model, observations)
         if isinstance(observations, dict):
             for key, values in observations.items():
                 self._check(f"observation {key!r}", values, index, takes_nan)
@@ -108,16 +108,19 @@ def _surely_finite(values: NDArray[Any]) -> bool:
     return values.size <= FEW_VALUES and math.isfinite(sum(values.ravel().tolist()))
 
 
-def _takes_nan(policy: Any, observations: Any) -> bool:
+def _takes_nan(model: Any, observations: Any) -> bool:
     """Whether the policy's outputs are finite, as with a features extractor that puts numbers in the place of NaN."""
-    policy = uncompiled(policy)
+    policy = uncompiled(model.policy)
     kind = policy_kind(policy)
-    outputs_of = None if kind is None else kind.actions or kind.values
-    if outputs_of is None:
+    if kind is None or model.get_vec_normalize_env() is not None:  # whose running mean becomes NaN for good
         return False
     try:
         with th.no_grad():
-            return bool(outputs_of(policy, {"observations": policy.obs_to_tensor(observations)[0]}).isfinite().all())
+            batch = {"observations": policy.obs_to_tensor(observations)[0]}
+            # Values of actions need actions: those algorithms do not take NaN
+            return all(
+                outputs(policy, batch).isfinite().all() for outputs in (kind.actions, kind.values) if outputs is not None
+            )
     except Exception:  # as of torch's distributions; what is wrong with the observations must be said in any case
         return False
 

@@ -37,4 +37,5 @@ def full_signature(cls: type) -> Signature:
 
 
 def _is_optional(parameter: Parameter) -> bool:
-    return parameter.kind is Parameter.POSITIONAL_OR_KEYWORD and parameter.default is not Parameter.empty
+    is_positional = parameter.kind in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return is_positional and parameter.default is not Parameter.empty

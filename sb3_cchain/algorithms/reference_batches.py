@@ -108,7 +108,7 @@ class ReferenceMinibatches:
 
     def __init__(self, buffer: RolloutBuffer):
         self._get = buffer.get
-        self._is_shared = is_shared(buffer.get, buffer._get_samples, buffer.to_torch)
+        self._is_shared = is_shared(buffer, "get", "_get_samples", "to_torch")
         self._sample: Any = None
 
     def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
@@ -147,7 +147,7 @@ class PreviousRollout:
 
     def __init__(self, buffer: RolloutBuffer, previous: PyTorchObs | None):
         self._get = buffer.get
-        self._is_shared = is_shared(buffer.get, buffer._get_samples, buffer.to_torch)
+        self._is_shared = is_shared(buffer, "get", "_get_samples", "to_torch")
         self._previous = previous
         # Observations of the rollout that is being trained on
         self.current: PyTorchObs | None = None

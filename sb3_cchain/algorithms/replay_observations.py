@@ -17,21 +17,6 @@ _DRAWS = (ReplayBuffer.sample, DictReplayBuffer.sample)
 _GATHERS = (ReplayBuffer._get_samples, DictReplayBuffer._get_samples, NStepReplayBuffer._get_samples)
 
 
-class _CopyingSample:
-    """
-    Stands in for a buffer's ``sample()``, and copies what that gives.
-
-    :param buffer: The replay buffer
-    """
-
-    def __init__(self, buffer: ReplayBuffer):
-        self.sample = buffer.sample
-        self.own_sample = vars(buffer).get("sample")  # set by the user on this object
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return copied(self.sample(*args, **kwargs))
-
-
 @contextmanager
 def kept_minibatches(buffer: ReplayBuffer) -> Iterator[None]:
     """
@@ -40,10 +25,11 @@ def kept_minibatches(buffer: ReplayBuffer) -> Iterator[None]:
 
     :param buffer: The replay buffer
     """
-    if _fills_memory_again(buffer):
-        with replaced(buffer, "sample", _CopyingSample(buffer)):
-            yield
-    else:
+    if not _fills_memory_again(buffer):
+        yield
+        return
+    sample = buffer.sample
+    with replaced(buffer, "sample", lambda *args, **kwargs: copied(sample(*args, **kwargs))):
         yield
 
 
@@ -57,29 +43,19 @@ def kept(buffer: ReplayBuffer, minibatch: Any) -> Any:
 
 
 @contextmanager
-def aside(buffer: ReplayBuffer) -> Iterator[Any]:
+def unchanged(buffer: ReplayBuffer) -> Iterator[None]:
     """
     Draw from the replay buffer of a model that is being trained, for other ends than training. What a buffer sets in itself
-    when it is drawn from, such as the indices whose priorities follow the losses, is not set afterwards; what it changes in
-    place, such as the elements of an array, is changed. Another thread may fill the buffer meanwhile.
+    when it is drawn from, such as the indices whose priorities follow the losses, is put back afterwards. What it changes in
+    place, such as the elements of an array, stays changed, and so do ``pos`` and ``full``: another thread may add transitions.
 
     :param buffer: The replay buffer
-    :return: What to draw from: a copy with the same transitions
     """
     before = dict(vars(buffer))
-    sample = before.pop("sample", None)
-    if isinstance(sample, _CopyingSample):
-        sample = sample.own_sample
-    if sample is None:
-        result: Any = object.__new__(type(buffer))  # copy() leaves out what is not pickled, such as HerReplayBuffer's `env`
-        vars(result).update(before)
-        yield result
-        return
-    # A function that was put on this very object draws from it, and not from a copy
     try:
-        yield buffer
+        yield
     finally:
-        for name in vars(buffer).keys() - before.keys() - {"sample"}:
+        for name in vars(buffer).keys() - before.keys():
             delattr(buffer, name)
         vars(buffer).update({name: value for name, value in before.items() if name not in ("pos", "full")})
 
@@ -97,9 +73,13 @@ def sample_observations(
     :param with_actions: Whether the actions are drawn, too
     :return: The observations; with actions ``observations`` and ``actions``
     """
-    if _is_overridden(buffer.sample, _DRAWS) or _is_overridden(buffer._get_samples, _GATHERS) or is_shared(buffer.to_torch):
-        with aside(buffer) as drawn_from:
-            samples: Any = kept(buffer, drawn_from.sample(batch_size, env=env))
+    if (
+        _is_overridden(buffer, "sample", _DRAWS)
+        or _is_overridden(buffer, "_get_samples", _GATHERS)
+        or is_shared(buffer, "to_torch")
+    ):
+        with unchanged(buffer):
+            samples: Any = kept(buffer, buffer.sample(batch_size, env=env))
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         indices: Any = buffer.sample(batch_size)
@@ -115,9 +95,9 @@ def sample_observations(
 
 
 def _fills_memory_again(buffer: ReplayBuffer) -> bool:
-    return is_shared(buffer.sample, buffer._get_samples, buffer.to_torch)
+    return is_shared(buffer, "sample", "_get_samples", "to_torch")
 
 
-def _is_overridden(method: Callable[..., Any], originals: tuple[Callable[..., Any], ...]) -> bool:
+def _is_overridden(buffer: ReplayBuffer, name: str, originals: tuple[Callable[..., Any], ...]) -> bool:
     # By a subclass, or by an attribute of the buffer
-    return getattr(method, "__func__", None) not in originals
+    return getattr(getattr(buffer, name, None), "__func__", None) not in originals

@@ -11,7 +11,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
-from sb3_cchain.algorithms.replay_observations import aside
+from sb3_cchain.algorithms.replay_observations import unchanged
 from sb3_cchain.analysis.metrics.gradients import Objective, minibatch_gradients
 from sb3_cchain.analysis.metrics.ntk import gram_matrix
 from sb3_cchain.networks.algorithm_kinds import is_recurrent
@@ -86,7 +86,8 @@ def q_ntk(model: DQN, n_transitions: int = 100) -> th.Tensor:
     """
     assert model.replay_buffer is not None
     # Without repetition, as equal transitions are one dimension; but a HerReplayBuffer draws goals as well as transitions
-    with aside(model.replay_buffer) as buffer:
+    buffer = model.replay_buffer
+    with unchanged(buffer):
         if isinstance(buffer, HerReplayBuffer):
             replay: Any = buffer.sample(n_transitions, env=model._vec_normalize_env)
         else:

@@ -14,7 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from sb3_cchain.algorithms.replay_observations import aside
+from sb3_cchain.algorithms.replay_observations import unchanged
 from sb3_cchain.analysis.health_figures import group_of, hidden_activations, trained_groups, unit_outputs
 from sb3_cchain.analysis.metrics.dormancy import dormant_scores, mean_activity
 from sb3_cchain.analysis.metrics.rank import singular_values, srank
@@ -259,8 +259,8 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
 def _replayed_values(model: OffPolicyAlgorithm, batch_size: int) -> tuple[NDArray[Any], NDArray[Any], float]:
     """Values, their targets, and the greatest value that the rewards can add up to."""
     assert model.replay_buffer is not None
-    with aside(model.replay_buffer) as buffer:
-        sample = buffer.sample(batch_size, env=model._vec_normalize_env)
+    with unchanged(model.replay_buffer):
+        sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
     policy: Any = uncompiled(model.policy)
     kind = policy_kind(policy)
     assert kind is not None

@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_cchain.methods.optimizer_wrapper import nested_wrappers
 from sb3_cchain.networks.compiled import uncompiled
+from sb3_cchain.networks.injection_policies import Injectable
 from sb3_cchain.networks.model_optimizers import model_optimizers
 
 # Modules of the policies of SB3 and sb3-contrib that end in, or are, an output layer
@@ -54,12 +55,16 @@ def output_weights(policy: nn.Module) -> set[str]:
     for name, module in policy.named_modules():
         if _HEADS.fullmatch(name):
             name, module = _last_layer(name, module)
+            if not isinstance(module, (nn.Linear, Injectable)):
+                continue  # not known
             found |= {each for each, parameter in module.named_parameters(prefix=name) if parameter.dim() > 1}
     return found
 
 
 def _last_layer(name: str, module: nn.Module) -> tuple[str, nn.Module]:
     while isinstance(module, nn.Sequential):
-        child, module = [(child, each) for child, each in module.named_children() if any(True for _ in each.parameters())][-1]
-        name = f"{name}.{child}"
+        children = [(child, each) for child, each in module.named_children() if list(each.parameters())]
+        if not children:
+            break
+        name, module = f"{name}.{children[-1][0]}", children[-1][1]
     return name, module

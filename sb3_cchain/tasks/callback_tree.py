@@ -53,9 +53,9 @@ def require_unchanged_network(callback: BaseCallback) -> None:
     :param callback: A callback that looks at the network between rollouts, when training starts
     :raises ValueError: When ``learn()`` was given a callback before it that changes the network then
     """
-    for given in iterate_callbacks(callback.locals.get("callback")):
-        if given is callback:
-            return
+    given_to_learn = list(iterate_callbacks(callback.locals.get("callback")))
+    before = given_to_learn[: given_to_learn.index(callback)] if callback in given_to_learn else []
+    for given in before:
         if getattr(given, "changes_network", False):
             raise ValueError(
                 f"{type(callback).__name__} must come before {type(given).__name__}, which changes the network at the same "

@@ -1,6 +1,7 @@
 """The task sequence that a model is trained in, and when it began."""
 
 from collections.abc import Mapping
+from math import isnan
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -39,7 +40,7 @@ def other_sequence(model: BaseAlgorithm, env: VecEnv) -> str | None:
         return None
     present = describe_sequence(env)
     clock = TaskClock(past["steps_per_task"], first_task=past["first_task"])
-    clock.set(max(model.num_timesteps - past["start"] - 1, 0))  # that of the last step
+    clock.set(max(model.num_timesteps - past["start"] - env.num_envs, 0))  # that of the last step
     last_task = clock.due_task
     if past["first_task"] != present["first_task"]:
         return f"its first task is {present['first_task']} instead of {past['first_task']}"
@@ -67,4 +68,8 @@ def differing_task(tasks: list[Any], other_tasks: list[Any]) -> str | None:
 def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # NumPy's
         value = value.tolist()
-    return [_plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return "nan" if isinstance(value, float) and isnan(value) else value  # NaN is not equal to itself
