@@ -9,7 +9,7 @@ from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.double_dqn import DoubleDQN
 from sb3_cchain.algorithms.q_network import QValues, finite_td_loss, joint_pass, log_q_churn
 from sb3_cchain.algorithms.reference_batches import REFERENCES
-from sb3_cchain.algorithms.replay_observations import kept, sample_observations
+from sb3_cchain.algorithms.replay_observations import kept_minibatches, sample_observations
 from sb3_cchain.churn import ChurnReducers
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.networks.evaluation_mode import evaluation_mode, has_training_mode
@@ -79,7 +79,10 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
         :raises ValueError: When the loss is NaN or infinite. The parameters have not been updated.
         """
         self.churn_state.weights = None
-        DoubleDQN.train(self, gradient_steps, batch_size)
+        assert self.replay_buffer is not None
+        # Not ChurnAlgorithm's, because `_loss()` has the churn loss in it
+        with kept_minibatches(self.replay_buffer):
+            DoubleDQN.train(self, gradient_steps, batch_size)
 
     def _excluded_save_params(self) -> list[str]:
         # It belongs to the replay buffer, which is saved apart
@@ -98,7 +101,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
 
         # Independent of the minibatch. It waits for the next update, which measures on it what this update changes
         assert self.replay_buffer is not None
-        replay_data, next_minibatch = kept(self.replay_buffer, replay_data), None
+        next_minibatch = None
         if self.churn_reference == "independent":
             reference = sample_observations(self.replay_buffer, batch_size, self._vec_normalize_env)
         else:
@@ -132,7 +135,7 @@ class CChainDQN(ChurnAlgorithm, DoubleDQN):
             return self._next_minibatch, drawn
         self.churn_reducer.forget_reference()  # a saved model's: the minibatch that it belongs to is not saved
         assert self.replay_buffer is not None
-        return drawn, kept(self.replay_buffer, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))
+        return drawn, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
     def _all_q_values(self, replay_data: ReplayBufferSamples, reference: Observations) -> QValues:
         previous = self.churn_reducer.reference

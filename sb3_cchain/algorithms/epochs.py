@@ -1,13 +1,14 @@
 """The minibatches of an epoch, and any samples of it that lie side by side."""
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cchain.algorithms.own_memory import copied, is_shared
+from sb3_cchain.algorithms.own_memory import fills_memory_again
 from sb3_cchain.networks.policy_inputs import joined, n_observations, rows
 from sb3_cchain.replaced import replaced
 
@@ -28,7 +29,7 @@ def draw_epoch(
     :return: The minibatches that it gives
     """
     if not _is_sb3s(buffer, get):
-        minibatches = [copied(minibatch) for minibatch in get(batch_size, *args, **kwargs)]
+        minibatches = [deepcopy(minibatch) for minibatch in get(batch_size, *args, **kwargs)]
         return HeldEpoch(minibatches, joined(*(minibatch.observations for minibatch in minibatches)))
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         epoch = GatheredEpoch(buffer, list(get(batch_size, *args, **kwargs)))
@@ -41,7 +42,7 @@ def _is_sb3s(buffer: RolloutBuffer, get: Callable[..., Iterator[Any]]) -> bool:
     return (
         getattr(get, "__func__", None) in (RolloutBuffer.get, DictRolloutBuffer.get)
         and gathers in (RolloutBuffer._get_samples, DictRolloutBuffer._get_samples)
-        and not is_shared(buffer, "to_torch")
+        and not fills_memory_again(buffer, "to_torch")
     )
 
 

@@ -1,13 +1,14 @@
 """Reference batches of on-policy algorithms: samples of rollouts, outside the minibatch whose update they measure."""
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from typing import Any, Protocol
 
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_cchain.algorithms.epochs import draw_epoch
-from sb3_cchain.algorithms.own_memory import copied, is_shared
+from sb3_cchain.algorithms.own_memory import fills_memory_again
 
 # Where reference batches are taken from, by the name in `churn_reference`
 REFERENCES = ("independent", "next")
@@ -108,7 +109,7 @@ class ReferenceMinibatches:
 
     def __init__(self, buffer: RolloutBuffer):
         self._get = buffer.get
-        self._is_shared = is_shared(buffer, "get", "_get_samples", "to_torch")
+        self._fills_memory_again = fills_memory_again(buffer, "get", "_get_samples", "to_torch")
         self._sample: Any = None
 
     def get(self, batch_size: int | None = None, *args: Any, **kwargs: Any) -> Iterator[Any]:
@@ -118,7 +119,7 @@ class ReferenceMinibatches:
         :param kwargs: Further keyword arguments of the buffer's own method
         :return: The minibatches of one epoch
         """
-        minibatches = [copied(each) if self._is_shared else each for each in self._get(batch_size, *args, **kwargs)]
+        minibatches = [deepcopy(each) if self._fills_memory_again else each for each in self._get(batch_size, *args, **kwargs)]
         for position, minibatch in enumerate(minibatches):
             self._sample = minibatches[(position + (len(minibatches) + 1) // 2) % len(minibatches)]
             yield minibatch
@@ -147,7 +148,7 @@ class PreviousRollout:
 
     def __init__(self, buffer: RolloutBuffer, previous: PyTorchObs | None):
         self._get = buffer.get
-        self._is_shared = is_shared(buffer, "get", "_get_samples", "to_torch")
+        self._fills_memory_again = fills_memory_again(buffer, "get", "_get_samples", "to_torch")
         self._previous = previous
         # Observations of the rollout that is being trained on
         self.current: PyTorchObs | None = None
@@ -160,7 +161,7 @@ class PreviousRollout:
         :return: The minibatch
         """
         for minibatch in self._get(batch_size, *args, **kwargs):
-            self.current = copied(minibatch.observations) if self._is_shared else minibatch.observations
+            self.current = deepcopy(minibatch.observations) if self._fills_memory_again else minibatch.observations
             yield minibatch
 
     def reference(self, needs: Sequence[str] = (), of_policy: bool = True) -> PyTorchObs | None:

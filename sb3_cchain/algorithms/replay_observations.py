@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_cchain.algorithms.own_memory import copied, is_shared
+from sb3_cchain.algorithms.own_memory import fills_memory_again
 from sb3_cchain.churn.reducer import Observations
 from sb3_cchain.replaced import replaced
 
@@ -25,21 +26,12 @@ def kept_minibatches(buffer: ReplayBuffer) -> Iterator[None]:
 
     :param buffer: The replay buffer
     """
-    if not _fills_memory_again(buffer):
+    if not fills_memory_again(buffer, "sample", "_get_samples", "to_torch"):
         yield
         return
     sample = buffer.sample
-    with replaced(buffer, "sample", lambda *args, **kwargs: copied(sample(*args, **kwargs))):
+    with replaced(buffer, "sample", lambda *args, **kwargs: deepcopy(sample(*args, **kwargs))):
         yield
-
-
-def kept(buffer: ReplayBuffer, minibatch: Any) -> Any:
-    """
-    :param buffer: A replay buffer
-    :param minibatch: What was just drawn from it
-    :return: The same, which stays as it is when further transitions are drawn
-    """
-    return copied(minibatch) if _fills_memory_again(buffer) else minibatch
 
 
 @contextmanager
@@ -76,10 +68,10 @@ def sample_observations(
     if (
         _is_overridden(buffer, "sample", _DRAWS)
         or _is_overridden(buffer, "_get_samples", _GATHERS)
-        or is_shared(buffer, "to_torch")
+        or fills_memory_again(buffer, "to_torch")
     ):
         with unchanged(buffer):
-            samples: Any = kept(buffer, buffer.sample(batch_size, env=env))
+            samples: Any = buffer.sample(batch_size, env=env)
         return {"observations": samples.observations, "actions": samples.actions} if with_actions else samples.observations
     with replaced(buffer, "_get_samples", lambda indices, env=None: indices):
         indices: Any = buffer.sample(batch_size)
@@ -92,10 +84,6 @@ def sample_observations(
     else:
         observations = buffer.to_torch(normalized)
     return {"observations": observations, "actions": buffer.to_torch(buffer.actions[chosen])} if with_actions else observations
-
-
-def _fills_memory_again(buffer: ReplayBuffer) -> bool:
-    return is_shared(buffer, "sample", "_get_samples", "to_torch")
 
 
 def _is_overridden(buffer: ReplayBuffer, name: str, originals: tuple[Callable[..., Any], ...]) -> bool:

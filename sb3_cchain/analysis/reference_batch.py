@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_cchain.algorithms.replay_observations import kept, unchanged
+from sb3_cchain.algorithms.replay_observations import kept_minibatches, unchanged
 from sb3_cchain.networks.batch_outputs import Batch
 
 
@@ -25,8 +25,8 @@ def sample_batch(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: int)
     """
     if isinstance(model, OffPolicyAlgorithm):
         assert model.replay_buffer is not None
-        with unchanged(model.replay_buffer):
-            sample = kept(model.replay_buffer, model.replay_buffer.sample(batch_size, env=model._vec_normalize_env))
+        with unchanged(model.replay_buffer), kept_minibatches(model.replay_buffer):
+            sample = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
         return {"observations": sample.observations, "actions": sample.actions}
     buffer: Any = model.rollout_buffer
     indices = np.random.permutation(buffer.buffer_size * buffer.n_envs)[:batch_size]
