@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_cchain.networks.activations import CReLU, FourierFeatures
 from sb3_cchain.networks.dict_observations import DictObservations
-from sb3_cchain.networks.spectral_norm import SpectralNormLinear
+from sb3_cchain.networks.spectral_norm import SpectralNormLinear, settle_spectral_norms
 
 
 class _Hidden(DictObservations):
@@ -102,9 +102,7 @@ class SpectralNormPolicy(ActorCriticVariant):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        for module in self.modules():
-            if isinstance(module, SpectralNormLinear):
-                module.iterate(15)  # for the weights of `ortho_init`
+        settle_spectral_norms(self)  # for the weights of `ortho_init`
 
 
 class DQNVariant(_Hidden, DQNPolicy):
