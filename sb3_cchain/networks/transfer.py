@@ -1,8 +1,8 @@
 """Takes what a model has learned to an environment whose spaces are others."""
 
-from typing import Any, NamedTuple
+from copy import deepcopy
+from typing import NamedTuple
 
-import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
@@ -166,8 +166,4 @@ def _copy_state(old: BasePolicy, new: BasePolicy, kept: list[str]) -> None:
     for name in set(kept) & new_parameters.keys():
         state = old.optimizer.state.get(old_parameters[name])
         if state:
-            new.optimizer.state[new_parameters[name]] = {key: _copied(value) for key, value in state.items()}
-
-
-def _copied(value: Any) -> Any:
-    return value.clone() if isinstance(value, th.Tensor) else value
+            new.optimizer.state[new_parameters[name]] = deepcopy(state)
