@@ -1,6 +1,6 @@
 """The networks of an SB3 actor-critic policy, as functions of observations."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, TypeGuard
 
 import torch as th
@@ -120,24 +120,17 @@ def _has_parameters(parameters: dict[str, Any]) -> bool:
     return "weight" in parameters and "bias" in parameters
 
 
-def hooks_of(policy: nn.Module, kinds: Sequence[str] = (*FORWARD_HOOKS, *BACKWARD_HOOKS)) -> list[dict[int, Any]]:
-    """
-    :param policy: A policy
-    :param kinds: Kinds of hooks
-    :return: Where PyTorch keeps the hooks of each of its modules
-    """
-    return [getattr(module, kind) for module in policy.modules() for kind in kinds]
-
-
 def is_instrumented(policy: nn.Module) -> bool:
     """
     :param policy: A policy
     :return: Whether hooks look at its modules, or a method was replaced on one of them, not in its class
     """
-    # What torch.compile() returns has its own `forward` there
-    modules = [module for module in policy.modules() if not hasattr(module, "_orig_mod")]
-    replaced = any(name in vars(module) for module in modules for name in _METHODS)
-    return replaced or any(hooks_of(policy))
+    return any(
+        any(getattr(module, kind) for kind in (*FORWARD_HOOKS, *BACKWARD_HOOKS))
+        # What torch.compile() returns has its own `forward` there
+        or (not hasattr(module, "_orig_mod") and not vars(module).keys().isdisjoint(_METHODS))
+        for module in policy.modules()
+    )
 
 
 def is_plain(policy: nn.Module) -> bool:
