@@ -338,9 +338,12 @@ class Own(BaseCallback):
 
 
 def test_objects_in_a_python_file_are_the_same_in_another_process(tmp_path):
-    assert plain({"callback": [Own()], "kind": Own, "noise": NormalActionNoise(np.zeros(1), np.ones(1))}) == {
+    assert plain(
+        {"callback": [Own()], "kind": Own, "wrapper": [{Own: {"n": 1}}], "noise": NormalActionNoise(np.zeros(1), np.ones(1))}
+    ) == {
         "callback": ["Own"],
         "kind": "Own",
+        "wrapper": [{"Own": {"n": 1}}],
         "noise": "NormalActionNoise(mu=[0.], sigma=[1.])",
     }
 

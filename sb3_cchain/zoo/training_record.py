@@ -79,7 +79,14 @@ def plain(value: Any) -> Any:
     :param value: An option or hyperparameters
     :return: The same as JSON holds it; classes, functions and objects that do not describe themselves by their names
     """
-    return json.loads(json.dumps(value, default=_name))
+    return json.loads(json.dumps(_without_class_keys(value), default=_name))
+
+
+def _without_class_keys(value: Any) -> Any:
+    """A Python file of settings may map the class of a wrapper to its arguments."""
+    if isinstance(value, dict):
+        return {_name(key) if isinstance(key, type) else key: _without_class_keys(each) for key, each in value.items()}
+    return [_without_class_keys(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def _name(value: Any) -> str:
