@@ -418,6 +418,23 @@ def test_what_rl_zoo_writes_is_read(value):
     assert read == value and type(read) is OrderedDict
 
 
+def test_settings_in_a_python_file_are_read_back(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import numpy as np\n"
+        "from gymnasium.wrappers import TimeLimit\n"
+        "from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes\n"
+        "hyperparams = {'CartPole-v1': dict(policy='MlpPolicy', n_timesteps=np.int64(32), n_steps=32, gamma=np.float32(0.5),"
+        " env_wrapper=[{TimeLimit: dict(max_episode_steps=9)}])}\n"
+    )
+    train(tmp_path, "ppo_cchain", "CartPole-v1", 32, "-conf", file)
+    command("enjoy", "--algo", "ppo_cchain", "--env", "CartPole-v1", "-f", tmp_path, "-n", 10, "--no-render")
+    with file.open("a") as settings:
+        settings.write("hyperparams['CartPole-v1']['callback'] = [StopTrainingOnMaxEpisodes(9)]\n")
+    with pytest.warns(UserWarning, match=r"will not play this model: .*config\.yml cannot be read: .*StopTraining"):
+        train(tmp_path, "ppo_cchain", "CartPole-v1", 32, "-conf", file)
+
+
 @pytest.mark.parametrize(
     "text",
     [

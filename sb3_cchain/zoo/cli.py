@@ -35,7 +35,7 @@ from sb3_cchain.zoo.gym_packages import take_gym_packages
 from sb3_cchain.zoo.hub import working_clients
 from sb3_cchain.zoo.playing import Playing
 from sb3_cchain.zoo.search import register_search_spaces
-from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder
+from sb3_cchain.zoo.settings import SettingsLoader, add_settings_file, hyperparams_folder, what_cannot_be_read
 
 __all__ = ["hyperparams_folder", "register_algorithms", "run"]
 
@@ -117,11 +117,7 @@ def _told_in_a_line() -> Iterator[None]:
     try:
         yield
     except yaml.constructor.ConstructorError as error:
-        where = error.problem_mark.name if error.problem_mark is not None else "the settings"
-        sys.exit(
-            f"{where} cannot be read: {error.problem}. Import classes of your own by --gym-packages MODULE. Objects, such as "
-            "callbacks in a Python file of settings, cannot be read back: give their names in a YAML file"
-        )
+        sys.exit(what_cannot_be_read(error))
 
 
 def train(arguments: list[str]) -> None:

@@ -3,6 +3,7 @@
 import shutil
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from copy import copy
 from functools import partial
@@ -13,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import optuna
 import rl_zoo3.exp_manager
+import yaml
 from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
@@ -39,7 +41,7 @@ from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, write_resumed_from
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
-from sb3_cchain.zoo.settings import missing_parts, settings_path
+from sb3_cchain.zoo.settings import missing_parts, read_saved, settings_path, what_cannot_be_read
 from sb3_cchain.zoo.statistics import statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
 from sb3_cchain.zoo.training_record import differences, plain, write_record
@@ -204,6 +206,13 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
                 f"but there is no file {path}"
             )
         return path
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        super()._save_config(saved_hyperparams)
+        try:
+            read_saved(Path(self.params_path) / "config.yml")
+        except yaml.constructor.ConstructorError as error:
+            warnings.warn(f"enjoy and record_video will not play this model: {what_cannot_be_read(error)}", stacklevel=2)
 
     def create_callbacks(self) -> None:
         """Make the callbacks of the command line's options."""

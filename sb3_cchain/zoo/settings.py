@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
@@ -153,6 +154,18 @@ def read_saved(path: Path) -> dict[str, Any]:
     return content
 
 
+def what_cannot_be_read(error: yaml.constructor.ConstructorError) -> str:
+    """
+    :param error: Raised when saved settings were read
+    :return: What is wrong, and the mend
+    """
+    where = error.problem_mark.name if error.problem_mark is not None else "the settings"
+    return (
+        f"{where} cannot be read: {error.problem}. Import classes of your own by --gym-packages MODULE. Objects, such as "
+        "callbacks in a Python file of settings, cannot be read back: give their names in a YAML file"
+    )
+
+
 def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict[str, Any]:
     if not isinstance(node, yaml.SequenceNode):
         raise yaml.constructor.ConstructorError(None, None, "an OrderedDict must be a list of pairs", node.start_mark)
@@ -161,3 +174,6 @@ def _ordered_dict(loader: yaml.FullLoader, node: yaml.Node) -> OrderedDict[str, 
 
 
 SettingsLoader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered_dict)
+
+# NumPy's numbers in a Python file of settings are written as plain ones, which can be read back
+yaml.add_multi_representer(np.generic, lambda dumper, n: dumper.represent_data(n.item()))  # type: ignore[type-abstract]
