@@ -6,13 +6,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import yaml
-from stable_baselines3 import PPO
+from rl_zoo3.callbacks import ParallelTrainCallback
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, unwrap_vec_normalize
 
-from sb3_cchain import CChainPPO
+from sb3_cchain import CChainPPO, CChainSAC
+from sb3_cchain.algorithms.contrib import CChainTQC
 from sb3_cchain.callbacks import read_returns
 from sb3_cchain.checkpoint import saved_timesteps
 from sb3_cchain.zoo.experiment import ExperimentManager, make_run_folder, statistics_path
@@ -84,6 +86,19 @@ def test_training_goes_on_at_its_step_and_task(algo, cls, tmp_path, seen):
     first, second = (read_returns(tmp_path / "tb" / NAME / f"{cls.__name__}_{number}" / "returns.csv") for number in (1, 2))
     assert second[: len(first)] == first
     assert {row["task_id"] for row in second} == {0, 1, 2} and second[-1]["timesteps"] == 160
+
+
+@pytest.mark.parametrize("algo, cls", [("sac_cchain", CChainSAC), ("tqc_cchain", CChainTQC), ("sac", SAC)])
+def test_training_in_parallel_trains_a_model_of_the_same_class(algo, cls, tmp_path, monkeypatch):
+    trained = set()
+    monkeypatch.setattr(ParallelTrainCallback, "train", lambda self: trained.add(type(self._model)))
+    monkeypatch.setattr(ParallelTrainCallback, "_on_training_end", lambda self: None)  # which waits for the thread
+    command(
+        *("train", "--algo", algo, "--env", "Pendulum-v1", "-n", 40, "-f", tmp_path, *FAST, *NO_EVALUATION),
+        *("-params", "callback:'rl_zoo3.callbacks.ParallelTrainCallback'", "learning_starts:10", "train_freq:10"),
+        *("normalize:False", "policy_kwargs:dict(net_arch=[8])", "use_sde:False"),
+    )
+    assert trained == {cls}
 
 
 def test_without_a_number_training_goes_on_to_that_of_the_settings(tmp_path, seen):

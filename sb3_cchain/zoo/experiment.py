@@ -5,6 +5,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -13,9 +14,12 @@ from typing import Any
 
 import gymnasium as gym
 import optuna
+import rl_zoo3.callbacks
 import rl_zoo3.exp_manager
 import yaml
 from rl_zoo3.utils import get_latest_run_id
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
@@ -302,8 +306,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
                     if isinstance(callback, TaskProgressBar):
                         callback.close()  # at once, before what follows is printed
 
+        # RL Zoo's ParallelTrainCallback trains a copy, which it would load as a plain SAC or TQC
+        base = next((base for base in (SAC, TQC) if isinstance(model, base)), None)
         try:
-            super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
+            with nullcontext() if base is None else replaced(rl_zoo3.callbacks, base.__name__, type(model)):
+                super().learn(SimpleNamespace(learn=learn_and_tell, env=model.env, policy=model.policy))  # type: ignore[arg-type]
         except SystemExit:  # by SIGTERM, with checkpoints: no model is saved
             self._summary.print()
             raise
