@@ -59,6 +59,14 @@ def test_beta_is_searched_for_dqn_cchain(tmp_path):
     assert len(set(ratios)) == 2 and all(1e-3 <= ratio <= 1e-1 for ratio in ratios)
 
 
+@pytest.mark.parametrize("algo", ["dqn_cchain", "double_dqn", "ppo_cchain", "sac_cchain"])
+def test_reports_show_the_values_that_powers_and_differences_stand_for(algo):
+    search.register_search_spaces()
+    trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask()
+    sampled = search.HYPERPARAMS_SAMPLER[algo](trial, 0, 1, {"using_her_replay_buffer": False})
+    assert {name: trial.user_attrs[name] for name in ("gamma", "batch_size")}.items() <= sampled.items()
+
+
 @pytest.mark.parametrize("algo, n_actions, low, high", [("ppo_cchain", 0, 1e2, 1e6), ("ppo_cchain", 2, 5e-3, 5.0)])
 def test_the_range_of_beta_depends_on_the_actions(algo, n_actions, low, high):
     search.register_search_spaces()

@@ -55,7 +55,10 @@ def sample_double_dqn_params(
     }
     if additional_args["using_her_replay_buffer"]:
         sampled = sample_her_params(trial, sampled, additional_args["her_kwargs"])
-    return convert_double_dqn_params(sampled)
+    params = convert_double_dqn_params(sampled)
+    for name in ("gamma", "batch_size"):  # shown in reports, as RL Zoo's samplers do
+        trial.set_user_attr(name, params[name])
+    return params
 
 
 def convert_double_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
