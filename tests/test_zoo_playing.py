@@ -84,11 +84,16 @@ def test_tasks_are_evaluated_with_masks():
 def normalised(tmp_path_factory):
     """A run folder with checkpoints of both kinds, of eight environments."""
     folder = tmp_path_factory.mktemp("normalised")
-    train(folder, "--save-freq", 32, "--checkpoint-freq", 32, algo="ppo", env="CartPole-v1", params=("normalize:True",))
+    evaluation = ("--eval-freq", 160, "--eval-episodes", 1)  # one alone, at step 160
+    options = ("--save-freq", 32, "--checkpoint-freq", 32)
+    train(folder, *options, algo="ppo", env="CartPole-v1", params=("normalize:True",), evaluation=evaluation)
     return folder / "ppo/CartPole-v1_1"
 
 
-@pytest.mark.parametrize("name, count", [("CartPole-v1.zip", 8 + 256), ("rl_model_32_steps.zip", 8 + 32)])
+COUNTS = [("CartPole-v1.zip", 8 + 256), ("rl_model_32_steps.zip", 8 + 32), ("best_model.zip", 8 + 160)]
+
+
+@pytest.mark.parametrize("name, count", COUNTS)
 def test_a_model_is_played_with_its_statistics(normalised, name, count):
     settings, statistics = get_saved_hyperparams(str(normalised / "CartPole-v1"))
     playing = Playing()
@@ -97,7 +102,7 @@ def test_a_model_is_played_with_its_statistics(normalised, name, count):
     assert unwrap_vec_normalize(env).obs_rms.count == pytest.approx(count, abs=0.01)
 
 
-@pytest.mark.parametrize("name, count", [("CartPole-v1.zip", 8 + 256), ("rl_model_32_steps.zip", 8 + 32)])
+@pytest.mark.parametrize("name, count", COUNTS)
 def test_a_model_is_inspected_with_its_statistics(normalised, name, count):
     env, _ = make_as_trained(normalised / name, "CartPole-v1", 1, 0, {}, None)
     assert env.obs_rms.count == pytest.approx(count, abs=0.01) and not isinstance(env.venv, VecNormalize)

@@ -20,7 +20,7 @@ from sb3_cchain.checkpoint import check_model_file, load_statistics
 from sb3_cchain.checkpoint.checkpoint_folder import MODEL
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
 from sb3_cchain.zoo.settings import read_saved
-from sb3_cchain.zoo.statistics import checkpoint_statistics
+from sb3_cchain.zoo.statistics import statistics_beside
 
 
 def make_as_trained(
@@ -69,7 +69,7 @@ def make_as_trained(
             "it was trained with normalisation, and its statistics are within the checkpoint: give a file of them as "
             "--vec-normalize"
         )
-    statistics = statistics or checkpoint_statistics(model_path)
+    statistics = statistics or statistics_beside(model_path)
     if statistics is not None and statistics.is_file():
         load_statistics(normalize, statistics)  # instead of those of the end of training
     return env, callbacks

@@ -46,7 +46,7 @@ from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, write_resumed_from
 from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
 from sb3_cchain.zoo.settings import missing_parts, read_saved, settings_path, what_cannot_be_read
-from sb3_cchain.zoo.statistics import statistics_path
+from sb3_cchain.zoo.statistics import BEST_STATISTICS, statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
 from sb3_cchain.zoo.training_record import differences, plain, write_record
 
@@ -183,10 +183,9 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         Copy what evaluations have left in the run folder that training goes on from. What is of later evaluations than the
         checkpoint will come again.
         """
-        for name in ("evaluations.npz", "best_model.zip", f"{self.env_name}/vecnormalize.pkl"):
-            if (folder / name).is_file():
-                with write_safely(f"{self.save_path}/{name}") as path:
-                    shutil.copyfile(folder / name, path)
+        for name in ("evaluations.npz", "best_model.zip"):
+            _copy_if_there(folder / name, f"{self.save_path}/{name}")
+        _copy_if_there(statistics_path(folder / "best_model.zip", self.env_name), f"{self.params_path}/vecnormalize.pkl")
 
     def _check_trained_agent(self) -> None:
         check_model_file(self.trained_agent)
@@ -324,7 +323,9 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         :raises SystemExit: With checkpoints, when training was interrupted by Ctrl-C
         """
         print(f"Saving to {self.save_path}")
-        save_statistics(model, f"{self.params_path}/vecnormalize.pkl")
+        statistics = f"{self.params_path}/vecnormalize.pkl"
+        _copy_if_there(Path(statistics), f"{self.save_path}/{BEST_STATISTICS}")  # until now those of the best model
+        save_statistics(model, statistics)
         if isinstance(model, OffPolicyAlgorithm) and self.save_replay_buffer:
             print("Saving replay buffer")
             with write_safely(f"{self.save_path}/replay_buffer.pkl") as path:
@@ -352,6 +353,12 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             else:
                 manager.specified_callbacks = add_to_callback(self.specified_callbacks, method.callbacks[0], values)
         return super(ExperimentManager, manager).objective(trial)
+
+
+def _copy_if_there(source: Path, target: str) -> None:
+    if source.is_file():
+        with write_safely(target) as path:
+            shutil.copyfile(source, path)
 
 
 def _resumable(wrapper: Callable[[gym.Env], gym.Env] | None, env: gym.Env) -> ResumableEnv:

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_cchain.checkpoint import check_model_file, load_statistics
 from sb3_cchain.envs import TaskCaption
-from sb3_cchain.zoo.statistics import checkpoint_statistics
+from sb3_cchain.zoo.statistics import statistics_beside
 
 _create_test_env = rl_zoo3.utils.create_test_env
 
@@ -79,7 +79,7 @@ class Playing:
 
     def _take_statistics_of(self, model_path: Path) -> None:
         normalize = None if self._env is None else unwrap_vec_normalize(self._env)
-        statistics = checkpoint_statistics(model_path)
+        statistics = statistics_beside(model_path)
         if normalize is not None and statistics is not None and statistics.is_file():
             load_statistics(normalize, statistics)
 

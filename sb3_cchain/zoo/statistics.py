@@ -3,22 +3,28 @@
 import re
 from pathlib import Path
 
+BEST_STATISTICS = "best_model_vecnormalize.pkl"
+
 
 def statistics_path(model_path: str | Path, env_name: str) -> Path:
     """
     :param model_path: A model saved by ``sb3-cchain train``
     :param env_name: The environment's name in RL Zoo's folders
-    :return: Where the statistics of its ``VecNormalize`` are: those of a checkpoint beside it, those of the final and of the
-        best model in the folder of the settings
+    :return: Where the statistics of its ``VecNormalize`` are: beside it, or those of the final model in the folder of the
+        settings. There are also those of the best model until training ends
     """
     path = Path(model_path)
-    return checkpoint_statistics(path) or path.parent / env_name / "vecnormalize.pkl"
+    return statistics_beside(path) or path.parent / env_name / "vecnormalize.pkl"
 
 
-def checkpoint_statistics(model_path: Path) -> Path | None:
+def statistics_beside(model_path: Path) -> Path | None:
     """
     :param model_path: A saved model
-    :return: For a checkpoint by ``--save-freq`` where its statistics are, None for any other model
+    :return: Where the statistics are of a checkpoint by ``--save-freq``, and of the best model once training has ended; None
+        for any other model
     """
+    if model_path.name == "best_model.zip":
+        statistics = model_path.with_name(BEST_STATISTICS)
+        return statistics if statistics.is_file() else None
     checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", model_path.stem)
     return None if checkpoint is None else model_path.with_name(f"{checkpoint[1]}_vecnormalize_{checkpoint[2]}.pkl")
