@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.grid.results import read_results
 from benchmarks.grid.run import ROOT, short_name, suite_lines
 from benchmarks.grid.suites import SUITES
+from benchmarks.number_text import thousands, with_error
 from benchmarks.report.cells import Cell, Cells, make_cells
 from benchmarks.report.collapses import COLLAPSED, collapses, collapses_table
 from benchmarks.report.markdown import markdown_table
@@ -54,9 +55,9 @@ def readme_table(cells: Cells) -> str:
         here = [cells.get((env_id, method)) for method in METHODS]
         done = [cell for cell in here if cell is not None]
         figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
-        lengths = f"{done[0].results[0].n_tasks} × {done[0].results[0].steps_per_task // 1000} 000"
+        lengths = f"{done[0].results[0].n_tasks} × {thousands(done[0].results[0].steps_per_task)}"
         n_seeds = ", ".join(map(str, sorted({len(cell.seeds) for cell in done})))
-        printed = [f"{figure.mean:.0f} ± {figure.standard_error:.0f}" for figure in figures]
+        printed = [with_error(figure.mean, figure.standard_error, 0) for figure in figures]
         rows.append([short_name(env_id), lengths, n_seeds, *map(_score, here), *printed])
     labels = [method_label(SUITE, method) for method in METHODS]
     header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
@@ -94,7 +95,7 @@ def documentation_tables(results: Path) -> dict[str, str]:
 def _score(cell: Cell | None) -> str:
     if cell is None:
         return MISSING
-    return f"{cell.mean:.0f}" if cell.error is None else f"{cell.mean:.0f} ± {cell.error:.0f}"
+    return with_error(cell.mean, cell.error, 0)
 
 
 def plot(cells: Cells, path: Path) -> None:

@@ -30,6 +30,7 @@ from benchmarks.grid.run import Run
 from benchmarks.grid.score_table import score_table
 from benchmarks.grid.suites import SUITES
 from benchmarks.grid.view import duration
+from benchmarks.number_text import thousands
 from sb3_cchain.checkpoint import check_writable
 from sb3_cchain.methods.registry import METHOD_NAMES
 
@@ -146,8 +147,8 @@ def list_grid(grid: Sequence[Run], results: Path, logs: Path, console: Console) 
             seconds_left += seconds
             status = duration(seconds)
             if n_steps:
-                status += f"; goes on from step {n_steps:,}".replace(",", " ")
-        steps = f"{run.n_tasks} x {run.steps_per_task:,}".replace(",", " ")
+                status += f"; goes on from step {thousands(n_steps)}"
+        steps = f"{run.n_tasks} x {thousands(run.steps_per_task)}"
         console.print(f"{run.name:{width}}  {steps:>14} steps  {status}", soft_wrap=True, highlight=False)
     console.print(
         f"{len(grid)} runs, {n_done} of them done. The other {len(grid) - n_done} take {duration(seconds_left)} on a core, "

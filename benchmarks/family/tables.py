@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.family.case import Case
 from benchmarks.family.training import Run, read
+from benchmarks.number_text import thousands
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.places import LINE_LENGTH
 from sb3_cchain.analysis.metrics.intervals import difference_interval
@@ -150,8 +151,7 @@ def about(case: Case) -> str:
     """
     tasks = f"{case.n_tasks} tasks of " if case.n_tasks > 1 else ""
     steps, every = (
-        f"{steps:,}".replace(",", " ") if steps >= 10_000 else str(steps)
-        for steps in (case.steps // case.n_tasks, case.eval_freq)
+        thousands(steps) if steps >= 10_000 else str(steps) for steps in (case.steps // case.n_tasks, case.eval_freq)
     )
     words = (
         f"{tasks}{steps} steps; {case.source}. Evaluated every {every} steps, by {case.n_eval_episodes} episodes without "

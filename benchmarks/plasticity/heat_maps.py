@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 
 from benchmarks.grid.results import Result
+from benchmarks.number_text import thousands
 from benchmarks.plasticity.runs import snapshot_times
 from benchmarks.plasticity.snapshots import read_snapshots
 from benchmarks.report.task_tables import in_order
@@ -53,13 +54,13 @@ def plot_heat_maps(results: Sequence[Result], lines: Mapping[str, Method], path:
         row[0].set_ylabel(f"{lines[line].label}, seed {result.seed}")
         for panel, end in zip(row, times, strict=True):
             panel.set(xticks=[], yticks=[])
-            panel.set_title(f"step {end:,}\nno matrix".replace(",", " "), fontsize=9)
+            panel.set_title(f"step {thousands(end)}\nno matrix", fontsize=9)
         for steps, matrix in matrices.items():
             panel = row[bisect_left(times, steps)]
             image = panel.imshow(cosines(matrix), cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
             numbers = ntk_statistics(th.as_tensor(matrix, dtype=th.float64))
             shown = f"srank {numbers['srank']}, off-diagonal sum {numbers['off_diagonal_sum']:.2g}"
-            panel.set_title(f"step {steps:,}\n".replace(",", " ") + shown, fontsize=9)
+            panel.set_title(f"step {thousands(steps)}\n{shown}", fontsize=9)
     figure.colorbar(image, ax=panels, label="cosine of two minibatches' gradients", shrink=0.6)
     figure.suptitle(title, parse_math=False)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from benchmarks.grid.results import Result, read_results
 from benchmarks.grid.run import short_name
+from benchmarks.number_text import thousands
 from benchmarks.plasticity.heat_maps import plot_heat_maps
 from benchmarks.plasticity.runs import EXPERIMENT, lines, quantities
 from benchmarks.report.figures import plot_quantities
@@ -48,7 +49,7 @@ def section(results: Sequence[Result], docs: Path) -> str:
     """
     run = results[0]
     labels = lines(run.suite, [result.line for result in results])
-    env, steps = short_name(run.env_id), f"{run.steps_per_task:,}".replace(",", " ")
+    env, steps = short_name(run.env_id), thousands(run.steps_per_task)
     seeds = sorted({result.seed for result in results})
     title = f"{env}, {run.n_tasks} tasks of {steps} steps, {'seeds' if len(seeds) > 1 else 'seed'} {seeds_text(seeds)}"
     name = f"{PICTURES}/{env}_{run.n_tasks}x{run.steps_per_task}"

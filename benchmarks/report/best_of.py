@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.grid.run import lines_in_order, short_name, strength_of, suite_methods
 from benchmarks.grid.strengths import shortest, split_line
+from benchmarks.number_text import with_error
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import Table
@@ -120,8 +121,8 @@ def best_table(found: Sequence[Best], paper: Table) -> str:
             words = verdict_words(best.cell, figure, paper.lengths[best.env_id])
             if lacking:
                 words = f"{TOO_FEW}: {symbol} = {', '.join(lacking)} missing"
-            printed = f"{figure.mean:.{digits}f} ± {figure.standard_error:.{digits}f} "
-            printed += f"(best of {len(of_paper)})" if of_paper else "(one)"
+            printed = with_error(figure.mean, figure.standard_error, digits)
+            printed += f" (best of {len(of_paper)})" if of_paper else " (one)"
         rows.append(
             [
                 f"{short_name(best.env_id)}, {method_label(best.suite, best.method)}",

@@ -17,6 +17,7 @@ from benchmarks.grid.run import (
     suite_methods,
 )
 from benchmarks.grid.suites import SUITES
+from benchmarks.number_text import with_error
 from benchmarks.report.best_of import WORDS as BEST_WORDS
 from benchmarks.report.best_of import Best, best_strengths, best_table, write_best
 from benchmarks.report.cells import Cells, make_cells
@@ -217,10 +218,10 @@ def _released_section(suite: str, cells: Cells, paper: Table) -> list[str]:
             if cell.released_scores is None:
                 without.append(name)
                 continue
-            both = [_score(*mean_and_error(scores), digits) for scores in (cell.scores, cell.released_scores)]
+            both = [with_error(*mean_and_error(scores), digits) for scores in (cell.scores, cell.released_scores)]
             printed = [MISSING, MISSING]
             if figure is not None:
-                printed = [_score(figure.mean, figure.standard_error, digits), verdict_words(cell, figure, length)]
+                printed = [with_error(figure.mean, figure.standard_error, digits), verdict_words(cell, figure, length)]
             rows.append([name, seeds_text(cell.seeds), *both, *printed])
     score = SUITES[suite].score
     if score is None or not rows:
@@ -229,10 +230,6 @@ def _released_section(suite: str, cells: Cells, paper: Table) -> list[str]:
     words = RELEASED_WORDS.format(rule=score.words)
     parts = ["### By the rule of the released code", words, markdown_table(header, rows)]
     return [*parts, f"Without it: {'; '.join(without)}."] if without else parts
-
-
-def _score(mean: float, error: float | None, digits: int) -> str:
-    return f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
 
 
 def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import lines_in_order, short_name, suite_lines
 from benchmarks.grid.strengths import split_line
+from benchmarks.number_text import with_error
 from benchmarks.report.cells import Cell, Cells
 from benchmarks.report.estimates import best_two
 from benchmarks.report.markdown import markdown_table
@@ -174,5 +175,4 @@ def _sums(sums: Mapping[str, float], methods: Sequence[str], digits: int) -> lis
 
 
 def _marked(mean: float, error: float | None, digits: int, mark: str | None) -> str:
-    text = f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
-    return {None: "{}", "best": "**{}**", "second": "<ins>{}</ins>"}[mark].format(text)
+    return {None: "{}", "best": "**{}**", "second": "<ins>{}</ins>"}[mark].format(with_error(mean, error, digits))

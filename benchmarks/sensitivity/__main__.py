@@ -17,6 +17,7 @@ from rich.console import Console
 from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.executor import train_all
 from benchmarks.grid.plan import BUDGETS
+from benchmarks.number_text import thousands
 from benchmarks.report.places import write_tables
 from benchmarks.run import list_grid
 from benchmarks.sensitivity.costs import measure, read_costs
@@ -67,8 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     tables["sensitivity_cost"] = cost_table("reference", list(scores["reference"][0]), costs)
     print("\n\n".join(tables.values()))
     if args.write:
-        n_tasks, steps = runs[0].n_tasks, f"{runs[0].steps_per_task:,}".replace(",", " ")
-        plot(scores, costs, args.docs / PICTURE, f"{n_tasks} tasks of {steps} steps")
+        title = f"{runs[0].n_tasks} tasks of {thousands(runs[0].steps_per_task)} steps"
+        plot(scores, costs, args.docs / PICTURE, title)
         write_tables(tables, args.docs)
 
 

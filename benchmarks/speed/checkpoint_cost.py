@@ -12,6 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecMonitor
 
 from benchmarks.grid.suites import SUITES
+from benchmarks.number_text import thousands
 from benchmarks.speed.settings import model_settings
 from benchmarks.speed.tables import Table
 from sb3_cchain import CChainDQN, CChainPPO, TrainingCheckpoint
@@ -139,8 +140,7 @@ def measure_share(make: Callable[[], BaseAlgorithm], suite: str, n_steps: int) -
             training = time.process_time() - start - sum(saving.save_processor_seconds)
             saved = saving.save_processor_seconds[-1]
     training *= save_freq / (model.num_timesteps - before)
-    steps = f"{save_freq:,}".replace(",", " ")
-    return [steps, f"{training:.0f} s", f"{saved:.2f} s", f"{100 * saved / (training + saved):.2f} %"]
+    return [thousands(save_freq), f"{training:.0f} s", f"{saved:.2f} s", f"{100 * saved / (training + saved):.2f} %"]
 
 
 def measure(make: Callable[[], BaseAlgorithm], save_freq: int, n_saves: int) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.number_text import with_error
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.places import LINE_LENGTH
 from benchmarks.supervised.learner import BATCH_SIZE, METHODS
@@ -91,7 +92,9 @@ def results_table(problem_name: str, results: Results) -> str:
             cells = [
                 _mean([run[part].mean() for run in runs]) for part in (slice(n_tasks), slice(n_part), slice(-n_part, None))
             ]
-        rows.append([label, str(len(results[method])), str(n_tasks), *cells, _cell(*PAPER[problem_name][method])])
+        rows.append(
+            [label, str(len(results[method])), str(n_tasks), *cells, with_error(*PAPER[problem_name][method], digits=4)]
+        )
     columns = ["accuracy", f"first {PART:.0%} of tasks", f"last {PART:.0%}"]
     header = ["", "seeds", "tasks", *columns, f"paper ({PAPER_SEEDS} seeds, {problem.n_tasks} tasks)"]
     parts = [markdown_table(header, rows), fill(_made_with(results), LINE_LENGTH)]
@@ -141,8 +144,5 @@ def _missing(problem_name: str, results: Results) -> str:
 
 def _mean(values: list[float]) -> str:
     """Their mean, and its standard error where there are several seeds."""
-    return f"{fmean(values):.4f}" if len(values) == 1 else _cell(fmean(values), stdev(values) / math.sqrt(len(values)))
-
-
-def _cell(mean: float, error: float) -> str:
-    return f"{mean:.4f} ± {error:.4f}"
+    error = stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
+    return with_error(fmean(values), error, digits=4)
