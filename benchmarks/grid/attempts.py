@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.grid.run import Run
 from sb3_cchain.checkpoint import write_safely
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, CheckpointFolder, step_folders
+from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, is_being_written, step_folders
 
 # Packages whose versions are recorded
 PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")
@@ -117,11 +117,8 @@ def remove_checkpoints(run: Run, logs: Path) -> None:
     """
     for attempt in _attempts(run, logs):
         for folder in attempt.folder.glob(CHECKPOINTS):
-            try:
-                CheckpointFolder(folder, keep=1, newest=run.total_steps * 2).close()
-            except ValueError:  # it is being written to
-                continue
-            shutil.rmtree(folder, ignore_errors=True)
+            if not is_being_written(folder):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _attempts(run: Run, logs: Path) -> Iterator[Attempt]:
