@@ -20,6 +20,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
+from benchmarks.rl_zoo_settings import DQN_CARTPOLE
+
 
 @dataclass(frozen=True)
 class Case:
@@ -106,11 +108,6 @@ PPO_CARTPOLE: dict[str, Any] = {
 PPO_PENDULUM: dict[str, Any] = {"n_steps": 1024, "gamma": 0.9, "learning_rate": 1e-3, "use_sde": True, "sde_sample_freq": 4}
 PPO_ACROBOT: dict[str, Any] = {"n_steps": 256, "gae_lambda": 0.94, "n_epochs": 4}
 PPO_MOUNTAIN_CAR: dict[str, Any] = {"n_steps": 16, "gae_lambda": 0.98, "n_epochs": 4}
-DQN_CARTPOLE: dict[str, Any] = {
-    **{"learning_rate": 2.3e-3, "batch_size": 64, "buffer_size": 100_000, "learning_starts": 1000, "gamma": 0.99},
-    **{"target_update_interval": 10, "train_freq": 256, "gradient_steps": 128},
-    **{"exploration_fraction": 0.16, "exploration_final_eps": 0.04},
-}
 DQN_ACROBOT: dict[str, Any] = {
     **{"learning_rate": 6.3e-4, "batch_size": 128, "buffer_size": 50_000, "learning_starts": 0, "target_update_interval": 250},
     **{"train_freq": 4, "gradient_steps": 1, "exploration_fraction": 0.12, "exploration_final_eps": 0.1},

@@ -10,6 +10,7 @@ from torch import nn
 from benchmarks.family.betas import BETAS
 from benchmarks.family.case import Case, Variant, action_noise
 from benchmarks.family.masked_symbols import continual_masked_symbols
+from benchmarks.rl_zoo_settings import DQN_CARTPOLE
 from sb3_cchain import CChainDQN, CChainPPO, CChainSAC, CChainTD3, DoubleDQN
 from sb3_cchain.algorithms.contrib import CChainMaskablePPO, CChainQRDQN, CChainRecurrentPPO
 
@@ -31,11 +32,6 @@ _TD3 = {
     "td3": Variant("TD3", TD3),
     "cchain": Variant("C-CHAIN TD3", CChainTD3),
     "cchain_value": Variant("C-CHAIN TD3 (values)", CChainTD3, {"churn_target": "value"}),
-}
-_CARTPOLE_DQN: dict[str, Any] = {
-    **{"learning_rate": 2.3e-3, "batch_size": 64, "buffer_size": 100_000, "learning_starts": 1000, "gamma": 0.99},
-    **{"target_update_interval": 10, "train_freq": 256, "gradient_steps": 128},
-    **{"exploration_fraction": 0.16, "exploration_final_eps": 0.04},
 }
 _CONTINUAL_CARTPOLE: dict[str, Any] = {
     **{"steps": 60_000, "eval_freq": 1500, "seeds": 3, "n_tasks": 4},
@@ -72,7 +68,7 @@ EVIDENCE = {
         _DQN,
         steps=50_000,
         eval_freq=2500,
-        settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256]}},
+        settings={**DQN_CARTPOLE, "policy_kwargs": {"net_arch": [256, 256]}},
     ),
     "dqn_lunar_lander": Case(
         "LunarLander, DQN",
@@ -112,7 +108,7 @@ EVIDENCE = {
             "cchain_1e-3": Variant("C-CHAIN QRDQN, β 1e-3 (default)", CChainQRDQN, {"target_churn_ratio": 1e-3}),
             "cchain_1e-4": Variant("C-CHAIN QRDQN, β 1e-4", CChainQRDQN, {"target_churn_ratio": 1e-4}),
         },
-        settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256], "n_quantiles": 10}},
+        settings={**DQN_CARTPOLE, "policy_kwargs": {"net_arch": [256, 256], "n_quantiles": 10}},
         **_CONTINUAL_CARTPOLE,
     ),
     "dqn_continual_cartpole": Case(
@@ -124,7 +120,7 @@ EVIDENCE = {
             "cchain": Variant("C-CHAIN DQN, β 0.01 (default)", CChainDQN),
             "cchain_1e-3": Variant("C-CHAIN DQN, β 1e-3", CChainDQN, {"target_churn_ratio": 1e-3}),
         },
-        settings={**_CARTPOLE_DQN, "policy_kwargs": {"net_arch": [256, 256]}},
+        settings={**DQN_CARTPOLE, "policy_kwargs": {"net_arch": [256, 256]}},
         **_CONTINUAL_CARTPOLE,
     ),
     "recurrent_ppo_continual_cartpole": Case(
