@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 
 def check_number(
@@ -85,6 +86,29 @@ def check_list(name: str, value: Any, of: str) -> list[Any]:
         return list(value)
     except TypeError:
         raise TypeError(f"`{name}` must be a list of {of}, got {value!r}") from None
+
+
+def check_array(
+    name: str, value: Any, shape: tuple[int, ...], words: str = "the shape", dtype: DTypeLike = np.float64
+) -> NDArray[Any]:
+    """
+    :param name: The argument's name
+    :param value: Its value: an array, or lists of numbers
+    :param shape: The shape that it must have
+    :param words: What the error calls this shape
+    :param dtype: Type of the numbers
+    :return: A copy, as an array
+    :raises ValueError: When it is not an array of finite numbers, or has another shape
+    """
+    try:
+        array: NDArray[Any] = np.array(value, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` must be an array of numbers, got {value!r}") from error
+    if array.shape != shape:
+        raise ValueError(f"`{name}` must have {words} {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite, got {value!r}")
+    return array
 
 
 def check_path(name: str, value: object) -> Path:

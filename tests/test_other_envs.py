@@ -192,7 +192,7 @@ def test_friction_drifts():
         (dict(friction_seed=-1), "`friction_seed` must be .* got -1"),
         (dict(n_tasks=2, frictions=[1.0]), r"`frictions` must have the shape \(n_tasks,\) = \(2,\), got \(1,\)"),
         (dict(n_tasks=1, frictions=[0.0]), "`frictions` must be finite and greater than 0"),
-        (dict(n_tasks=1, frictions=["ice"]), "`frictions` must be 1 numbers, got"),
+        (dict(n_tasks=1, frictions=["ice"]), "`frictions` must be an array of numbers, got"),
     ],
 )
 def test_bad_arguments_of_slippery_ant(kwargs, message):

@@ -11,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
-from sb3_cchain.validation import check_number
+from sb3_cchain.validation import check_array, check_number
 
 
 class ObservationOffset(gym.ObservationWrapper, RecordConstructorArgs):
@@ -36,14 +36,7 @@ class ObservationOffset(gym.ObservationWrapper, RecordConstructorArgs):
         if not np.issubdtype(space.dtype, np.floating):
             # The offset would be rounded, and the sum would overflow
             raise TypeError(f"An observation offset needs Box observations of floating-point numbers, got {space}")
-        try:
-            self.offset: NDArray[Any] = np.array(offset, dtype=space.dtype)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"`offset` must be an array of numbers, got {offset!r}") from error
-        if self.offset.shape != space.shape:
-            raise ValueError(f"`offset` must have the observations' shape {space.shape}, got {self.offset.shape}")
-        if not np.isfinite(self.offset).all():
-            raise ValueError(f"`offset` must be finite, got {offset!r}")
+        self.offset = check_array("offset", offset, space.shape, "the observations' shape", space.dtype)
         self.observation_space = spaces.Box(-np.inf, np.inf, space.shape, space.dtype)
 
     def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
@@ -96,7 +89,8 @@ class ContinualGymControl(ContinualEnv):
             self.offsets = np.random.default_rng(offset_seed).normal(0.0, offset_std, shape).astype(np.float32)
             self.offsets[0] = 0.0
         else:
-            self.offsets = _read_offsets(offsets, shape)
+            words = "the shape (n_tasks, *observation_shape) ="
+            self.offsets = check_array("offsets", offsets, shape, words, np.float32)
         tasks = [partial(_make_task, env_id, offset) for offset in self.offsets]
         super().__init__(tasks, steps_per_task, **kwargs)
 
@@ -111,18 +105,6 @@ class ContinualGymControl(ContinualEnv):
         """
         before, own = (self.offsets[task % len(self.offsets)] for task in (self.task_id - 1, self.task_id))
         self.task.offset[...] = (1 - weight) * before + weight * own  # type: ignore[attr-defined]
-
-
-def _read_offsets(offsets: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    try:
-        array = np.array(offsets, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`offsets` must be an array of numbers of the shape {shape}, got {offsets!r}") from error
-    if array.shape != shape:
-        raise ValueError(f"`offsets` must have the shape (n_tasks, *observation_shape) = {shape}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"`offsets` must be finite, got {offsets!r}")
-    return array
 
 
 def _observation_shape(env_id: str) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_cchain.envs.continual_env import ContinualEnv
-from sb3_cchain.validation import check_number
+from sb3_cchain.validation import check_array, check_number
 
 
 class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating[Any]]]):
@@ -49,7 +49,9 @@ class ContinualSlipperyAnt(ContinualEnv[NDArray[np.float64], NDArray[np.floating
             low, high = _check_range(friction_range)
             self.frictions = np.exp(np.random.default_rng(friction_seed).uniform(np.log(low), np.log(high), n_tasks))
         else:
-            self.frictions = _read_frictions(frictions, n_tasks)
+            self.frictions = check_array("frictions", frictions, (n_tasks,), "the shape (n_tasks,) =")
+            if not (self.frictions > 0).all():
+                raise ValueError(f"`frictions` must be finite and greater than 0, got {frictions!r}")
         tasks = [partial(_make_task, friction) for friction in self.frictions.tolist()]
         super().__init__(tasks, steps_per_task, **kwargs)
 
@@ -76,18 +78,6 @@ def _check_range(friction_range: Sequence[float]) -> tuple[float, float]:
     check_number("friction_range[0]", low, 0, exclusive=True)
     check_number("friction_range[1]", high, low)
     return low, high
-
-
-def _read_frictions(frictions: ArrayLike, n_tasks: int) -> NDArray[np.float64]:
-    try:
-        array = np.array(frictions, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`frictions` must be {n_tasks} numbers, got {frictions!r}") from error
-    if array.shape != (n_tasks,):
-        raise ValueError(f"`frictions` must have the shape (n_tasks,) = {(n_tasks,)}, got {array.shape}")
-    if not (np.isfinite(array) & (array > 0)).all():
-        raise ValueError(f"`frictions` must be finite and greater than 0, got {frictions!r}")
-    return array
 
 
 def _make_task(friction: float, **kwargs: Any) -> gym.Env:
