@@ -15,13 +15,13 @@ import math
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TextIO, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from benchmarks.grid.run import Run, as_json, suite_methods
 from benchmarks.grid.suites import SUITES
 from sb3_cchain.analysis.curves import Series
 from sb3_cchain.callbacks.continual_metrics import COLUMNS, task_averages
+from sb3_cchain.checkpoint import write_safely
 
 METRIC_PREFIXES = ("churn/", "churn_monitor/", "ntk/", "health/", "continual_eval/")
 METRICS_COLUMNS = ("timesteps", "name", "value")
@@ -272,11 +273,10 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
         "steps_per_second": round(result.steps_per_second, 1),
     }
     hidden = _hidden_name(result.path)
-    hidden.mkdir(parents=True)
-    with _synced(hidden / "run.json") as file:
-        file.write(json.dumps(fields, indent=1, allow_nan=False) + "\n")
+    with write_safely(hidden / "run.json") as path:
+        path.write_text(json.dumps(fields, indent=1, allow_nan=False) + "\n")
     for name, columns, rows in (("returns.csv", COLUMNS, returns), ("metrics.csv", METRICS_COLUMNS, metrics)):
-        with _synced(hidden / name) as file:
+        with write_safely(hidden / name) as path, open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
@@ -294,15 +294,6 @@ def write_result(result: Result, returns: Iterable[Mapping[str, Any]], metrics: 
         with suppress(FileNotFoundError):
             os.rename(result.path, replaced)
             shutil.rmtree(replaced)
-
-
-@contextmanager
-def _synced(path: Path) -> Iterator[TextIO]:
-    """A new file whose content is on the disk when it is closed: after a power cut, a rename alone may be there without it."""
-    with open(path, "w", newline="") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _hidden_name(path: Path) -> Path:
