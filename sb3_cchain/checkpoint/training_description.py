@@ -11,13 +11,11 @@ from sb3_cchain.checkpoint.environment_state import env_layers
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv, describe_single_environment
 from sb3_cchain.checkpoint.words import in_words
 
-# Arguments that do not change what is learned, are described by themselves, or are changed by callbacks
-_OTHER_ARGUMENTS = frozenset(
-    {
-        *("device", "verbose", "tensorboard_log", "monitor_wrapper", "_init_setup_model"),
-        *("policy", "env", "learning_starts"),
-    }
-)
+# Arguments that do not change what is learned, that are described by themselves, and that callbacks change
+_WITHOUT_EFFECT = frozenset({"device", "verbose", "tensorboard_log", "monitor_wrapper", "_init_setup_model"})
+_DESCRIBED_OTHERWISE = frozenset({"policy", "env"})
+_CHANGED_BY_CALLBACKS = frozenset({"learning_starts"})
+_OTHER_ARGUMENTS = _WITHOUT_EFFECT | _DESCRIBED_OTHERWISE | _CHANGED_BY_CALLBACKS
 
 
 def constructor_arguments(kind: type) -> set[str]:

@@ -29,13 +29,11 @@ from sb3_cchain.checkpoint.training_description import constructor_arguments
 from sb3_cchain.networks.model_optimizers import model_optimizers
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
 
-# Of a model: what is saved in other ways, and what belongs to the present process and its learn()
-_SKIPPED_OF_MODEL = frozenset(
-    {
-        *("policy", "device", "_logger", "_custom_logger", "verbose", "tensorboard_log"),
-        *("start_time", "_num_timesteps_at_start", "_total_timesteps"),
-    }
-)
+# Attributes of a model that are saved in other ways, that the present process gives it, and that its present learn() does
+_SAVED_OTHERWISE = frozenset({"policy"})
+_OF_PROCESS = frozenset({"device", "_logger", "_custom_logger", "verbose", "tensorboard_log"})
+_OF_LEARN = frozenset({"start_time", "_num_timesteps_at_start", "_total_timesteps"})
+_SKIPPED_OF_MODEL = _SAVED_OTHERWISE | _OF_PROCESS | _OF_LEARN
 # Of a callback: what the present learn() gives it
 _SKIPPED_OF_CALLBACK = frozenset({"model", "parent", "locals", "globals", "_start_time"})
 # What gSDE draws before a rollout begins

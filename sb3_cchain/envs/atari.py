@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.validation import check_list, check_number
 
+# See ContinualAtari
+CORA_GAMES = ("SpaceInvaders", "Krull", "BeamRider", "Hero", "StarGunner", "MsPacman")
+
 
 class AtariTask(NamedTuple):
     """
@@ -52,10 +55,7 @@ class ContinualAtari(ContinualEnv[NDArray[np.uint8], np.int64]):
 
     def __init__(
         self,
-        tasks: Sequence[str | Mapping[str, Any]] = (
-            *("SpaceInvaders", "Krull", "BeamRider"),
-            *("Hero", "StarGunner", "MsPacman"),
-        ),
+        tasks: Sequence[str | Mapping[str, Any]] = CORA_GAMES,
         *,
         steps_per_task: int | Sequence[int] = 12_500_000,
         repeat_action_probability: float = 0.25,

@@ -23,6 +23,10 @@ from sb3_cchain.zoo.as_trained import load_as_trained
 from sb3_cchain.zoo.gym_packages import add_gym_packages, import_gym_packages
 from sb3_cchain.zoo.outputs import check_output_file, check_output_folder, print_line
 
+# What loading a model raises: of files, arguments and environments, and of settings that name what is not there
+BAD_VALUES = (TypeError, ValueError, yaml.YAMLError, gym.error.Error)
+MISSING_NAMES = (AttributeError, ImportError, NameError, SyntaxError)
+
 
 def make_parser() -> argparse.ArgumentParser:
     """
@@ -154,11 +158,7 @@ def _inspect(parser: argparse.ArgumentParser, args: argparse.Namespace, name: st
         model, callbacks = load_as_trained(
             path, args.algo, args.env, env_kwargs, args.seed, args.n_steps, args.device, args.vec_normalize
         )
-    except (
-        *(TypeError, ValueError, yaml.YAMLError, gym.error.Error),
-        # Of settings that name what is not there
-        *(AttributeError, ImportError, NameError, SyntaxError),
-    ) as error:
+    except (*BAD_VALUES, *MISSING_NAMES) as error:
         where = f"{args.env} {env_kwargs}" if env_kwargs else args.env
         message = " ".join(str(error).split())  # in one line
         parser.exit(2, f"{parser.prog}: error: {path} in {where}: {message}\n")

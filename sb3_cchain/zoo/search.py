@@ -96,8 +96,13 @@ def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sa
 
 # By the default: a decade beyond the values of the papers and their code on either side; two where no paper has values
 _BETAS = {
-    **{1e4: (1e2, 1e6), 1e2: (1.0, 1e4), 10: (0.1, 1e3), 0.05: (5e-3, 5.0)},
-    **{0.01: (1e-3, 1e-1), 1e-3: (1e-4, 1e-2), 5e-5: (5e-6, 5e-4)},
+    1e4: (1e2, 1e6),
+    1e2: (1.0, 1e4),
+    10: (0.1, 1e3),
+    0.05: (5e-3, 5.0),
+    0.01: (1e-3, 1e-1),
+    1e-3: (1e-4, 1e-2),
+    5e-5: (5e-6, 5e-4),
 }
 
 

@@ -11,11 +11,12 @@ from sb3_cchain.checkpoint import write_safely
 # Beside the checkpoints
 COMMAND = "command.json"
 
-# Options of RL Zoo that training depends on, and evaluations, which draw random numbers
-COMPARED = (
-    *("algo", "env", "seed", "env_kwargs", "eval_env_kwargs", "vec_env", "eval_freq", "eval_episodes", "n_eval_envs"),
-    *("save_freq", "log_interval", "progress"),  # callbacks must be the same, and logs go on
-)
+# Options of RL Zoo that must be as before: those that training depends on, those of evaluations, which draw random numbers,
+# and those by which it has the same callbacks and the same rhythm of the log
+OF_TRAINING = ("algo", "env", "seed", "env_kwargs", "vec_env")
+OF_EVALUATIONS = ("eval_env_kwargs", "eval_freq", "eval_episodes", "n_eval_envs")
+OF_CALLBACKS = ("save_freq", "log_interval", "progress")
+COMPARED = OF_TRAINING + OF_EVALUATIONS + OF_CALLBACKS
 
 
 def write_record(
