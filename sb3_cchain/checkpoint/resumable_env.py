@@ -22,7 +22,7 @@ from sb3_cchain.checkpoint.object_state import (
 )
 from sb3_cchain.checkpoint.random_state import random_state, restore_random_state
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
-from sb3_cchain.checkpoint.words import in_words
+from sb3_cchain.checkpoint.value_description import describe_value
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.reset import reset_env
 
@@ -195,8 +195,10 @@ def describe_single_environment(env: gym.Env) -> str:
             names.append(stock_class(type(env)).__name__)
         env = env.env
     name = "without id" if spec is None else spec.id
-    # `render_mode` is for the eye; what words cannot tell is left out
-    arguments = {} if spec is None else {key: in_words(value) for key, value in spec.kwargs.items() if key != "render_mode"}
+    # `render_mode` is for the eye; what cannot be described is left out
+    arguments = (
+        {} if spec is None else {key: describe_value(value) for key, value in spec.kwargs.items() if key != "render_mode"}
+    )
     told = ", ".join(f"{key}={word}" for key, word in sorted(arguments.items()) if word is not None)
     return f"{name}{f' with {told}' if told else ''} ({' '.join([*names, type(env).__name__])})"
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_cchain.checkpoint.environment_state import env_layers
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv, describe_single_environment
-from sb3_cchain.checkpoint.words import in_words
+from sb3_cchain.checkpoint.value_description import describe_value
 
 # Arguments that do not change what is learned, that are described by themselves, and that callbacks change
 _WITHOUT_EFFECT = frozenset({"device", "verbose", "tensorboard_log", "monitor_wrapper", "_init_setup_model"})
@@ -30,12 +30,12 @@ def constructor_arguments(kind: type) -> set[str]:
 def describe_model(model: BaseAlgorithm) -> dict[str, str]:
     """
     :param model: A model
-    :return: Its class and policy, and its hyperparameters as they are now; those that words cannot tell are left out
+    :return: Its class and policy, and its hyperparameters as they are now; those that cannot be described are left out
     """
     names = constructor_arguments(type(model))
     words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
     for name in sorted(names - _OTHER_ARGUMENTS):
-        value = in_words(vars(model).get(name, inspect.Parameter.empty), with_schedules=True)
+        value = describe_value(vars(model).get(name, inspect.Parameter.empty), with_schedules=True)
         if value is not None:
             words[name] = value
     return words

@@ -157,8 +157,8 @@ def print_switches(methods: dict[str, dict[Path, Rows]], console: Console) -> No
         if differ or any(end <= both_run_until for _, end in (*a[n:], *b[n:])):
             print_line(
                 console,
-                f"Other tasks: those of {file} begin at step {_listed(b)}, those of {first} at {_listed(a)}. Tasks of the "
-                "same number are not of the same steps",
+                f"Other tasks: those of {file} begin at step {_switch_steps(b)}, those of {first} at {_switch_steps(a)}. "
+                "Tasks of the same number are not of the same steps",
             )
 
 
@@ -175,5 +175,5 @@ def _switches(rows: Rows) -> list[tuple[int, int]]:
     return switches
 
 
-def _listed(switches: Sequence[tuple[int, int]]) -> str:
+def _switch_steps(switches: Sequence[tuple[int, int]]) -> str:
     return ", ".join(["0", *(f"{end:,}" for _, end in switches)])

@@ -1,4 +1,4 @@
-"""Values in words, to be compared with those of another process."""
+"""Describes values by text, to be compared with that of another process."""
 
 import inspect
 from collections.abc import Mapping
@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 
 
-def in_words(value: Any, with_schedules: bool = False) -> str | None:
+def describe_value(value: Any, with_schedules: bool = False) -> str | None:
     """
     :param value: Any
-    :param with_schedules: Whether functions are called as schedules, and told by three of their values
-    :return: It in words that are the same in another process; None for what words cannot tell
+    :param with_schedules: Whether functions are called as schedules, and described by three of their values
+    :return: Text that is the same in another process; None for what cannot be described so
     """
     if isinstance(value, type):
         return value.__name__ if value is not inspect.Parameter.empty else None
     if isinstance(value, Mapping):
-        words = {str(key): in_words(entry, with_schedules) for key, entry in value.items()}
-        return None if None in words.values() else str(words)
+        texts = {str(key): describe_value(entry, with_schedules) for key, entry in value.items()}
+        return None if None in texts.values() else str(texts)
     if isinstance(value, (list, tuple)):
-        items = [in_words(entry, with_schedules) for entry in value]
+        items = [describe_value(entry, with_schedules) for entry in value]
         return None if None in items else f"[{', '.join(map(str, items))}]"
     if isinstance(value, np.generic):
         value = value.item()
