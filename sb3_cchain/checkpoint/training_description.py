@@ -33,12 +33,12 @@ def describe_model(model: BaseAlgorithm) -> dict[str, str]:
     :return: Its class and policy, and its hyperparameters as they are now; those that cannot be described are left out
     """
     names = constructor_arguments(type(model))
-    words = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
-    for name in sorted(names - _OTHER_ARGUMENTS):
-        value = describe_value(vars(model).get(name, inspect.Parameter.empty), with_schedules=True)
-        if value is not None:
-            words[name] = value
-    return words
+    texts = {"algorithm": type(model).__name__, "policy": type(model.policy).__name__}
+    for name in sorted((names & vars(model).keys()) - _OTHER_ARGUMENTS):
+        text = describe_value(vars(model)[name], with_schedules=True)
+        if text is not None:
+            texts[name] = text
+    return texts
 
 
 def describe_env(env: VecEnv) -> dict[str, str]:

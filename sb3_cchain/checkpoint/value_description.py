@@ -1,6 +1,5 @@
 """Describes values by text, to be compared with that of another process."""
 
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ def describe_value(value: Any, with_schedules: bool = False) -> str | None:
     :return: Text that is the same in another process; None for what cannot be described so
     """
     if isinstance(value, type):
-        return value.__name__ if value is not inspect.Parameter.empty else None
+        return value.__name__
     if isinstance(value, Mapping):
         texts = {str(key): describe_value(entry, with_schedules) for key, entry in value.items()}
         return None if None in texts.values() else str(texts)
