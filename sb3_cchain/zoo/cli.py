@@ -56,7 +56,6 @@ def register_algorithms(playing: Playing | None = None) -> None:
     algorithms = {**_RL_ZOO_ALGOS, **{method.algo: method.algorithm for method in REGISTRY}}
     ALGOS.update({name: playing.algorithm(algorithm) if playing else algorithm for name, algorithm in algorithms.items()})
     register_search_spaces()
-    rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
 
 
 def call_sb3_cchain(command: list[str], *args: Any, gym_packages: Sequence[str] = (), **kwargs: Any) -> int:
