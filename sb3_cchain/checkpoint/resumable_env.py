@@ -233,8 +233,9 @@ class Parts:
         """
         :param other: Objects that are saved together with these
         """
-        for name in ("holders", "known", "skip"):
-            getattr(self, name).update(getattr(other, name))
+        self.holders.update(other.holders)
+        self.known.update(other.known)
+        self.skip.update(other.skip)
         self.strict += other.strict
         self.unused += other.unused
 
