@@ -20,7 +20,7 @@ from benchmarks.grid.attempts import remove_checkpoints
 from benchmarks.grid.plan import Rates
 from benchmarks.grid.results import Result, find_result, read_results, write_result
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import SECONDS_TO_STOP, Finished, Training, TrainingFailed
+from benchmarks.grid.training import SECONDS_TO_STOP, WAITING, Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure, Progress, View
 
 # How often a run that dies, by itself or with its machine, is started again
@@ -218,10 +218,7 @@ class LocalBackend(Backend):
 
     def __exit__(self, *error: object) -> None:
         if self._running:
-            print(
-                f"Waiting for runs to save themselves, up to {SECONDS_TO_STOP:.0f} s. Ctrl-C again ends them at once",
-                flush=True,
-            )
+            print(WAITING, flush=True)
         stop_all([training for training, _ in self._running.values()])
 
     def slots(self) -> int:

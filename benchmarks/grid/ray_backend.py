@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.grid.attempts import remove_checkpoints
 from benchmarks.grid.executor import Backend, checkout_commit, stop_all
 from benchmarks.grid.run import ROOT, Run
-from benchmarks.grid.training import SECONDS_TO_STOP, Finished, Training, TrainingFailed
+from benchmarks.grid.training import SECONDS_TO_STOP, WAITING, Finished, Training, TrainingFailed
 from benchmarks.grid.view import Failure
 
 # Parts of the checkout that no run needs
@@ -72,10 +72,7 @@ class RayBackend(Backend):
     def __exit__(self, *error: object) -> None:
         try:
             if self._running:
-                print(
-                    f"Waiting for runs to save themselves, up to {SECONDS_TO_STOP:.0f} s. Ctrl-C again ends them at once",
-                    flush=True,
-                )
+                print(WAITING, flush=True)
                 for reference in self._running:
                     self._ray.cancel(reference)
                 self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SECONDS_TO_STOP + 10)

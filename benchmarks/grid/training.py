@@ -25,6 +25,7 @@ from sb3_cchain.callbacks.continual_metrics import RETURNS_CSV
 
 # How long a training that is told to stop may take to save itself: it first completes its rollout
 SECONDS_TO_STOP = 60.0
+WAITING = f"Waiting for runs to save themselves, up to {SECONDS_TO_STOP:.0f} s. Ctrl-C again ends them at once"
 
 
 class TrainingFailed(RuntimeError):
