@@ -19,7 +19,7 @@ from sb3_cchain.callbacks.learn_call import LearnCall
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
 from sb3_cchain.tasks.sequence import sequence_start
-from sb3_cchain.tasks.signal import TaskSwitch, active_signal, told_task
+from sb3_cchain.tasks.signal import TaskSwitch, active_signal, displayed_task
 
 SECONDS_BETWEEN_DRAWINGS = 0.25
 
@@ -127,7 +127,7 @@ class TaskProgressBar(BaseCallback):
             if done and ("episode_return" in info or "episode" in info):
                 self._returns.append(info["episode_return"] if "episode_return" in info else info["episode"]["r"])
                 self._mean_return = float(np.mean(self._returns))
-        if self._switch.happened(told_task(self.model)):
+        if self._switch.happened(displayed_task(self.model)):
             self._mean_return = None
             self._returns.clear()
         return True

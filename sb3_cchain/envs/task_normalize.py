@@ -25,8 +25,7 @@ class TaskVecNormalize(VecNormalize):
     and the first in the new statistics.
 
     It reads the task from ``task_id`` in the infos of the first environment's resets; environments side by side switch
-    together.
-    With a :class:`~sb3_cchain.TaskSignal` in ``learn()``, it restarts where that says, from the step after its word on.
+    together. With a :class:`~sb3_cchain.TaskSignal` in ``learn()``, it restarts one step after the signal says so.
     Without either, while the task stays the same, and with ``restart=False`` it is ``VecNormalize``. With
     ``training=False`` statistics are neither updated nor restarted, so that an evaluation environment has the statistics of
     training (``EvalCallback`` copies them).

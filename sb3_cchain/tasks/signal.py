@@ -69,11 +69,11 @@ def episode_task(model: BaseAlgorithm) -> Any:
     return _known_task(model, first_reset_info(model.env)) if signal is None else signal.next_task
 
 
-def told_task(model: BaseAlgorithm) -> Any:
+def displayed_task(model: BaseAlgorithm) -> Any:
     """
     :param model: A model during ``learn()``
-    :return: The task of :func:`episode_task`, for a display, which must not count; None where there has been no switch of
-        environments that do not number their tasks
+    :return: The task of :func:`episode_task`, for a display. Unlike that it does not count a new environment as a task; None
+        where environments do not number their tasks and there has been no switch
     """
     assert model.env is not None
     signal = active_signal(model.env)

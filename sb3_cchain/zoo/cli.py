@@ -87,7 +87,7 @@ def run(command: str) -> None:
     playing = Playing()
     register_algorithms(playing if command in PLAYING else None)
     with (
-        _told_in_a_line(),
+        _exit_on_unreadable_settings(),
         # RL Zoo reads the files beside a model by a loader that runs what is in them
         replaced(yaml, "UnsafeLoader", SettingsLoader),
         # Callbacks, and push_to_hub, evaluate without masks
@@ -111,8 +111,8 @@ def run(command: str) -> None:
 
 
 @contextmanager
-def _told_in_a_line() -> Iterator[None]:
-    """What settings beside a model hold that cannot be read, such as the objects of a Python file."""
+def _exit_on_unreadable_settings() -> Iterator[None]:
+    """End with one line where the settings beside a model cannot be read, such as those with objects of a Python file."""
     try:
         yield
     except yaml.constructor.ConstructorError as error:
