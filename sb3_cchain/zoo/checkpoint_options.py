@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint, is_being_written
 from sb3_cchain.checkpoint.files import write_safely
+from sb3_cchain.zoo.rl_zoo_options import read_rl_zoo_options
 from sb3_cchain.zoo.training_record import COMMAND, read_record
 
 # In a run folder
@@ -106,10 +107,7 @@ def take_options(arguments: Sequence[str]) -> tuple[CheckpointOptions | None, li
     given, rest = parser.parse_known_args(arguments)
     if given == parser.parse_args([]):
         return None, rest
-    others = argparse.ArgumentParser(add_help=False)
-    others.add_argument("-i", "--trained-agent", default="")
-    others.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
-    other, _ = others.parse_known_args(rest)
+    other = read_rl_zoo_options(rest)
     for name in ("checkpoint_freq", "checkpoint_keep"):
         value = getattr(given, name)
         if value is not None and value < 1:
@@ -153,9 +151,7 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
         record = read_record(checkpoint.folder)
     except (ValueError, OSError) as error:
         sys.exit(f"--resume: {error}")
-    seed = argparse.ArgumentParser(add_help=False)
-    seed.add_argument("--seed", type=int, default=-1)
-    if seed.parse_known_args(arguments)[0].seed < 0:  # RL Zoo would draw one
+    if read_rl_zoo_options(arguments).seed < 0:  # RL Zoo would draw one
         arguments = [*arguments, "--seed", str(record["options"]["seed"])]
     freq = options.freq or record["checkpoint_freq"]
     keep = options.keep or record["checkpoint_keep"]
@@ -165,11 +161,7 @@ def find_resumed(options: CheckpointOptions, arguments: list[str]) -> tuple[Chec
 
 def _runs(arguments: Sequence[str]) -> list[Path]:
     """The run folders of an algorithm and an environment, the last one last."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo", default="ppo")
-    parser.add_argument("--env", default="CartPole-v1")
-    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
-    given, _ = parser.parse_known_args(arguments)
+    given = read_rl_zoo_options(arguments)
     name = re.compile(re.escape(given.env.replace("/", "-")) + r"_(\d+)(_[-0-9a-f]{36})?")  # the latter by --uuid
     numbers = {
         folder: int(match[1]) for folder in (given.log_folder / given.algo).glob("*") if (match := name.fullmatch(folder.name))

@@ -1,6 +1,5 @@
 """The settings of a training run: the YAML files of this package, and what RL Zoo saved beside a model."""
 
-import argparse
 import sys
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from sb3_cchain.methods import OptimizerMetrics
 from sb3_cchain.methods.registry import BY_ALGO, REGISTRY, Method
 from sb3_cchain.tasks.callback_tree import iterate_callbacks
+from sb3_cchain.zoo.rl_zoo_options import read_rl_zoo_options
 
 
 def hyperparams_folder() -> Path:
@@ -68,12 +68,7 @@ def add_settings_file(arguments: list[str]) -> list[str]:
     :raises SystemExit: When an algorithm of this package has no settings for the environment, or is to be optimised and has
         nothing to search
     """
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo", default="ppo")
-    parser.add_argument("--env", default="CartPole-v1")
-    parser.add_argument("-conf", "--conf-file")
-    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
-    given, _ = parser.parse_known_args(arguments)
+    given = read_rl_zoo_options(arguments)
     method = BY_ALGO.get(given.algo)
     if given.optimize_hyperparameters and method is not None and method.is_related and not method.grid:
         base = base_algo(method)
