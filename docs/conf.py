@@ -6,10 +6,12 @@ The table of contents is here and not in ``index.md``, because GitHub shows dire
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the tests read this file without Sphinx
+    from docutils import nodes
     from sphinx.application import Sphinx
 
 project = "sb3_cchain"
@@ -99,6 +101,16 @@ def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] += "\n".join(["", "```{toctree}", ":hidden:", f":caption: {caption}", "", *shown, "```", ""])
 
 
+def keep_numbers_together(app: Sphinx, page: nodes.document) -> None:
+    """Let no line, and no narrow column, end within a number such as 160 000."""
+    from docutils import nodes
+
+    for text in list(page.findall(nodes.Text)):
+        whole = re.sub(r"(?<=\d) (?=\d{3}\b)", "\N{NO-BREAK SPACE}", text)
+        if whole != text and not isinstance(text.parent, (nodes.literal, nodes.literal_block, nodes.math, nodes.math_block)):
+            text.parent.replace(text, nodes.Text(whole))
+
+
 def page_of(entry: str) -> str:
     """The page of an entry, which may begin with a title."""
     return entry.split("<")[-1].rstrip(">")
@@ -107,3 +119,4 @@ def page_of(entry: str) -> str:
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("source-read", add_contents)
+    app.connect("doctree-read", keep_numbers_together)
