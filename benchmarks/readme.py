@@ -106,7 +106,7 @@ def plot(cells: Cells, path: Path) -> None:
     :param path: PNG file
     """
     matplotlib = import_matplotlib()
-    figure = matplotlib.figure.Figure(figsize=(10, 3.8), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(7.5, 3.4), layout="constrained")  # small, so that a phone shows large letters
     panels = figure.subplots(1, len(TITLES), sharey=True)
     for panel, (method, title) in zip(panels, TITLES.items(), strict=True):
         results = cells[PICTURED, method].results
@@ -119,13 +119,14 @@ def plot(cells: Cells, path: Path) -> None:
             panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
         if (PICTURED, "oracle") in cells:
             panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
-        panel.set_title(title, fontweight="bold")
-        panel.set_xlabel("environment steps; the world changes at the dashed lines")
+        panel.set_title(title, fontsize="medium", fontweight="bold")
+        panel.xaxis.set_major_locator(matplotlib.ticker.MultipleLocator(400_000))
         panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
         panel.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("environment steps; the world changes at the dashed lines", fontsize="medium")
     panels[0].set_ylabel("return per episode")
     panels[-1].legend(loc="lower right", framealpha=1, edgecolor="white")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=160)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
