@@ -21,6 +21,9 @@ from sb3_cchain.methods.registry import Method
 
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
 
+# The lines of more methods than these hide each other in one panel
+SIDE_BY_SIDE = 3
+
 # Of no more seeds than these each has a line: the mean of one that learns and one that collapses is neither
 SEED_STYLES = ("-", "--", ":")
 
@@ -34,7 +37,7 @@ def plot_learning_curves(
 ) -> None:
     """
     Returns against environment steps. In a suite whose tasks differ in the size of their returns each task has a panel of its
-    own.
+    own; elsewhere each method has one, where there are many and neither frames nor a random policy.
 
     :param results: All runs in one environment, of one length
     :param path: PNG file
@@ -44,6 +47,10 @@ def plot_learning_curves(
         policy as a dotted line
     """
     suite, n_tasks, ends = SUITES[results[0].suite], results[0].n_tasks, results[0].task_boundaries
+    shown = {name: line for name, line in lines.items() if any(result.line == name for result in results)}
+    if len(shown) > SIDE_BY_SIDE and not suite.own_scales and not looks:
+        _plot_below_each_other(results, path, shown, title)
+        return
     frames = [look.frame for look in looks if look.frame is not None]
     frames_height = min(8 / n_tasks * max((frame.shape[0] / frame.shape[1] for frame in frames), default=0), 2.4)
     figure = _new_figure(9, 4 + frames_height)
@@ -153,6 +160,22 @@ def plot_reliable_metrics(
 def _new_figure(width: float, height: float) -> Any:
     plt.style.use("default")  # RL Zoo's plots leave seaborn's behind
     return plt.figure(figsize=(width, height), layout="constrained")
+
+
+def _plot_below_each_other(results: Sequence[Result], path: Path, lines: Mapping[str, Method], title: str | None) -> None:
+    """A panel for each method, which names it."""
+    figure = _new_figure(9, 1.3 * len(lines) + 0.5)
+    panels = figure.subplots(len(lines), 1, sharex=True, sharey=True)
+    for panel, (name, line) in zip(panels, lines.items(), strict=True):
+        _draw([panel] * results[0].n_tasks, results, {name: line}, RETURNS, SUITES[results[0].suite].smoothing)
+        panel.set_title(line.label, loc="left", fontsize="medium", fontweight="bold", color=line.color)
+    panels[-1].set_xlabel("environment steps")
+    figure.supylabel(RETURNS.label, fontsize="medium")
+    if title:
+        figure.suptitle(title, parse_math=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def _draw(
