@@ -102,11 +102,11 @@ def add_contents(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def keep_numbers_together(app: Sphinx, page: nodes.document) -> None:
-    """Let no line, and no narrow column, end within a number such as 160 000."""
+    """Let no line, and no narrow column, end within a number such as 160 000 or 3 ± 1."""
     from docutils import nodes
 
     for text in list(page.findall(nodes.Text)):
-        whole = re.sub(r"(?<=\d) (?=\d{3}\b)", "\N{NO-BREAK SPACE}", text)
+        whole = re.sub(r"(?<=\d) (?=\d{3}\b)|(?<=\d) (?=± \d)|(?<=\d ±) (?=\d)", "\N{NO-BREAK SPACE}", text)
         if whole != text and not isinstance(text.parent, (nodes.literal, nodes.literal_block, nodes.math, nodes.math_block)):
             text.parent.replace(text, nodes.Text(whole))
 
