@@ -14,7 +14,6 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from sb3_cchain import CChainPPO
 from sb3_cchain.algorithms import epochs, on_policy
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
-from sb3_cchain.networks import policy_networks
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
@@ -233,13 +232,3 @@ def test_hooks_see_training_mode_in_the_updates_alone():
         return sum(seen)
 
     assert n_training(CChainPPO) == n_training(PPO) == 4
-
-
-def test_direct_calls_of_layers_make_the_same_updates():
-    models = []
-    for plain in (True, False):
-        with nullcontext() if plain else patch.object(policy_networks, "is_plain", lambda policy: False):
-            model = CChainPPO("MlpPolicy", RandomEnv(), lean=False, **SETTINGS).learn(64 * 3)
-        assert_churn_was_reduced(model)
-        models.append(model)
-    assert_equal(*models)

@@ -1,6 +1,5 @@
 """PPO with churn reduction."""
 
-from contextlib import nullcontext
 from typing import Any
 
 from stable_baselines3 import PPO
@@ -8,7 +7,6 @@ from stable_baselines3 import PPO
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
 from sb3_cchain.algorithms.on_policy import PolicyChurnOptions
 from sb3_cchain.networks.lean_distributions import make_lean
-from sb3_cchain.networks.lean_forward import lean_forward
 from sb3_cchain.validation import check_bool
 
 
@@ -56,9 +54,8 @@ class CChainPPO(ChurnAlgorithm, PPO):
         ``"independent"`` for other random samples of the rollout, ``"next"`` for the minibatch that is trained on next, which
         costs less because its outputs are needed anyway
     :param churn_batch_size: Size of a reference batch in minibatches: 2, 4 or 8 in the paper's Appendix A.1
-    :param lean: Whether the policy acts without what PyTorch and SB3 do around the operations, which takes longer than a small
-        network: it gets a lean action distribution (:func:`~sb3_cchain.networks.make_lean`), and in rollouts the layers of an
-        MLP are called by their ``forward()``, as they are in ``train()``. The results are the same, to the bit.
+    :param lean: Whether the policy gets a lean action distribution (:func:`~sb3_cchain.networks.make_lean`), without checks
+        that take as long as a small network. The results are the same, to the bit.
     :param kwargs: Further keyword arguments of PPO
     :raises ValueError: Naming the churn argument that is out of its range; during training, for NaN or infinite rewards,
         observations and churn losses, before an update is made with them
@@ -97,14 +94,3 @@ class CChainPPO(ChurnAlgorithm, PPO):
         super()._setup_model()
         if self.lean:
             make_lean(self)
-
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
-        """
-        As PPO's.
-
-        :param args: As PPO's
-        :param kwargs: As PPO's
-        :return: Whether no callback stopped it
-        """
-        with lean_forward(self.policy) if self.lean else nullcontext():
-            return super().collect_rollouts(*args, **kwargs)

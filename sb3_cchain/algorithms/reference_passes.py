@@ -12,7 +12,7 @@ from sb3_cchain.churn import ChurnReducer
 from sb3_cchain.churn.gradient import carrying
 from sb3_cchain.networks.joint_evaluation import evaluate_jointly
 from sb3_cchain.networks.policy_inputs import n_observations, rows
-from sb3_cchain.networks.policy_networks import networks_of
+from sb3_cchain.networks.policy_networks import PolicyNetworks
 from sb3_cchain.networks.policy_outputs import actor_outputs, of_action_net
 from sb3_cchain.replaced import replaced
 
@@ -30,7 +30,7 @@ def joint_passes(
     :param references: Where its reference batches come from
     :return: What completes an update, to be called right after ``zero_grad()``
     """
-    networks = networks_of(policy)
+    networks = PolicyNetworks(policy)
     coef = reducer.coefficient.value
     churn_loss: th.Tensor | None = None
 
