@@ -1,7 +1,9 @@
 """Where CChainPPO's reference batches come from, and that they go through the policy with the minibatches."""
 
+import copy
 from contextlib import nullcontext
 from itertools import pairwise
+from types import MethodType
 from unittest.mock import patch
 
 import numpy as np
@@ -10,10 +12,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from torch import nn
 
 from sb3_cchain import CChainPPO
 from sb3_cchain.algorithms import epochs, on_policy
 from sb3_cchain.algorithms.reference_batches import ReferenceBatches
+from sb3_cchain.networks.joint_evaluation import can_evaluate_jointly
 from tests.churn_models import (
     ACTION_SPACES,
     DICT,
@@ -232,3 +236,75 @@ def test_hooks_see_training_mode_in_the_updates_alone():
         return sum(seen)
 
     assert n_training(CChainPPO) == n_training(PPO) == 4
+
+
+def forbid_action_0(policy):
+    def masked(self, latent):
+        logits = self.action_net(latent).clone()
+        logits[:, 0] = -1e9
+        return self.action_dist.proba_distribution(logits)
+
+    policy._get_action_dist_from_latent = MethodType(masked, policy)
+
+
+def double_outputs(policy):
+    forward = policy.action_net.forward
+    policy.action_net.forward = lambda latent: 2 * forward(latent)
+
+
+def shift_features(policy):
+    extract = policy.extract_features
+    policy.extract_features = lambda obs, *args: 1 + extract(obs, *args)
+
+
+def squash_features(policy):
+    """Of the shared extractor alone: SB3 also has the former one under the actor's and the critic's names."""
+    policy.features_extractor = copy.deepcopy(policy.features_extractor)
+    policy.features_extractor.flatten = nn.Sequential(nn.Flatten(), nn.Tanh())
+
+
+def take_the_critics_units(policy):
+    policy.mlp_extractor.forward_actor = policy.mlp_extractor.forward_critic
+
+
+def put_in_one_layer(policy):
+    policy.mlp_extractor.policy_net = nn.Sequential(nn.Linear(4, 64), nn.ReLU())
+
+
+def hook_outputs(policy):
+    policy.action_net.register_forward_hook(lambda _, inputs, outputs: 2 * outputs)
+
+
+CHANGES = (
+    forbid_action_0,
+    double_outputs,
+    shift_features,
+    squash_features,
+    take_the_critics_units,
+    put_in_one_layer,
+    hook_outputs,
+)
+
+
+@pytest.mark.parametrize("churn_coef", [0.0, 1e-6])
+@pytest.mark.parametrize("change", CHANGES)
+def test_changes_of_a_policy_count_in_rollouts_and_updates_as_in_ppo(change, churn_coef):
+    def learned(algorithm, change, **arguments):
+        settings = dict(n_steps=32, batch_size=8, n_epochs=2, seed=0, device="cpu")
+        model = algorithm("MlpPolicy", RandomEnv(), **settings, **arguments)
+        change(model.policy)
+        policy = model.learn(64).policy
+        return [*policy.action_net.parameters(), *policy.value_net.parameters()]
+
+    def close(ones, others):
+        return all(th.allclose(one, other, rtol=1e-3, atol=1e-5) for one, other in zip(ones, others, strict=True))
+
+    changed = learned(CChainPPO, change, churn_coef=churn_coef)
+    assert close(changed, learned(PPO, change))
+    assert not close(changed, learned(CChainPPO, lambda policy: None, churn_coef=churn_coef))
+
+
+def test_a_compiled_part_is_no_replaced_method():
+    policy = CChainPPO("MlpPolicy", RandomEnv(), device="cpu").policy
+    policy.mlp_extractor.policy_net = th.compile(policy.mlp_extractor.policy_net, backend="eager")
+    assert can_evaluate_jointly(policy)
