@@ -9,7 +9,6 @@ FORWARD_HOOKS = ("_forward_pre_hooks", "_forward_hooks")
 BACKWARD_HOOKS = ("_backward_pre_hooks", "_backward_hooks")
 # What a forward pass calls of a policy and its modules
 _METHODS = ("forward", "extract_features", "_get_action_dist_from_latent", "forward_actor", "forward_critic")
-_EXTRACTORS = ("features_extractor", "pi_features_extractor", "vf_features_extractor")
 
 
 class PolicyNetworks:
