@@ -152,7 +152,7 @@ def read_saved(path: Path) -> dict[str, Any]:
 def what_cannot_be_read(error: yaml.constructor.ConstructorError) -> str:
     """
     :param error: Raised when saved settings were read
-    :return: What is wrong, and the mend
+    :return: What is wrong, and what to do
     """
     where = error.problem_mark.name if error.problem_mark is not None else "the settings"
     return (

@@ -10,8 +10,8 @@ def statistics_path(model_path: str | Path, env_name: str) -> Path:
     """
     :param model_path: A model saved by ``sb3-cchain train``
     :param env_name: The environment's name in RL Zoo's folders
-    :return: Where the statistics of its ``VecNormalize`` are: beside it, or those of the final model in the folder of the
-        settings. There are also those of the best model until training ends
+    :return: Where the statistics of its ``VecNormalize`` are: beside it, or in the folder of the settings, which has those of
+        the best model until training ends, and then those of the final model
     """
     path = Path(model_path)
     return statistics_beside(path) or path.parent / env_name / "vecnormalize.pkl"
