@@ -10,7 +10,8 @@ def read_rl_zoo_options(arguments: Sequence[str]) -> argparse.Namespace:
     :param arguments: Arguments of RL Zoo's ``train``
     :return: Those that are read here, with RL Zoo's defaults
     """
-    parser = argparse.ArgumentParser(add_help=False)
+    # Without the usage, which would be of these options alone, in front of an error
+    parser = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
     parser.add_argument("--algo", default="ppo")
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--seed", type=int, default=-1)
