@@ -426,6 +426,7 @@ def test_the_legend_fits(suite, env_id, methods, tmp_path, monkeypatch):
         write(tmp_path, method, [[0, 1], [0, 1]], env_id, suite=suite)
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
+    monkeypatch.setattr("benchmarks.report.figures.SIDE_BY_SIDE", len(methods))  # in one panel, as with frames
     plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", suite_methods(suite))
     monkeypatch.undo()
     (figure,) = figures
