@@ -426,7 +426,7 @@ def test_the_legend_fits(suite, env_id, methods, tmp_path, monkeypatch):
         write(tmp_path, method, [[0, 1], [0, 1]], env_id, suite=suite)
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
-    monkeypatch.setattr("benchmarks.report.figures.SIDE_BY_SIDE", len(methods))  # in one panel, as with frames
+    monkeypatch.setattr("benchmarks.report.figures.MOST_IN_A_PANEL", len(methods))  # in one panel, as with frames
     plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", suite_methods(suite))
     monkeypatch.undo()
     (figure,) = figures
@@ -434,6 +434,22 @@ def test_the_legend_fits(suite, env_id, methods, tmp_path, monkeypatch):
     assert len(legend.get_texts()) == len(methods)
     box = legend.get_window_extent()
     assert 0 <= box.x0 and box.x1 <= figure.bbox.width
+    plt.close(figure)
+
+
+@pytest.mark.parametrize("n_methods", [3, 4])
+def test_many_methods_have_panels_of_their_own(n_methods, tmp_path, monkeypatch):
+    import matplotlib.pyplot as plt
+
+    for method in LONGEST_LABELS[:n_methods]:
+        write(tmp_path, method, [[0, 1], [0, 1]], ACROBOT)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    plot_learning_curves(whole_results(tmp_path), tmp_path / "picture.png", GYM_METHODS)
+    monkeypatch.undo()
+    (figure,) = figures
+    titles = {panel.get_title(loc="left") for panel in figure.axes}
+    assert titles == ({""} if n_methods == 3 else {GYM_METHODS[method].label for method in LONGEST_LABELS[:4]})
     plt.close(figure)
 
 

@@ -22,7 +22,7 @@ from sb3_cchain.methods.registry import Method
 SWITCH_STYLE: dict[str, Any] = dict(color="0.35", linestyle="--", linewidth=1)
 
 # The lines of more methods than these hide each other in one panel
-SIDE_BY_SIDE = 3
+MOST_IN_A_PANEL = 3
 
 # Of no more seeds than these each has a line: the mean of one that learns and one that collapses is neither
 SEED_STYLES = ("-", "--", ":")
@@ -48,7 +48,7 @@ def plot_learning_curves(
     """
     suite, n_tasks, ends = SUITES[results[0].suite], results[0].n_tasks, results[0].task_boundaries
     shown = {name: line for name, line in lines.items() if any(result.line == name for result in results)}
-    if len(shown) > SIDE_BY_SIDE and not suite.own_scales and not looks:
+    if len(shown) > MOST_IN_A_PANEL and not suite.own_scales and not looks:
         _plot_below_each_other(results, path, shown, title)
         return
     frames = [look.frame for look in looks if look.frame is not None]
@@ -75,7 +75,8 @@ def plot_learning_curves(
     panels[n_tasks // 2].set_xlabel("environment steps")
     if title:
         figure.suptitle(title, parse_math=False)
-    _save(figure, panels, path)
+    _add_legend(figure, panels)
+    _save(figure, path)
 
 
 def plot_quantities(
@@ -113,7 +114,8 @@ def plot_quantities(
     if title:
         figure.suptitle(title)
     panels[max(len(panels) - 2, 0)].set_xlabel("environment steps")  # in the middle of the last row
-    _save(figure, panels, path)
+    _add_legend(figure, panels)
+    _save(figure, path)
 
 
 def plot_reliable_metrics(
@@ -173,9 +175,7 @@ def _plot_below_each_other(results: Sequence[Result], path: Path, lines: Mapping
     figure.supylabel(RETURNS.label, fontsize="medium")
     if title:
         figure.suptitle(title, parse_math=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    _save(figure, path)
 
 
 def _draw(
@@ -208,8 +208,8 @@ def _draw_seeds(panel: Any, curves: Sequence[Series], line: Method, logarithmic:
             panel.plot(steps, values, linestyle=linestyle, marker="o" if len(steps) == 1 else None, **style)
 
 
-def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
-    """With one legend for all panels."""
+def _add_legend(figure: Any, panels: Sequence[Any]) -> None:
+    """One for all panels."""
     legend: dict[str, Any] = {}
     for panel in panels:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -219,6 +219,9 @@ def _save(figure: Any, panels: Sequence[Any], path: Path) -> None:
         if n_columns == 1 or drawn.get_window_extent().width <= figure.bbox.width:
             break
         drawn.remove()
+
+
+def _save(figure: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     plt.close(figure)
