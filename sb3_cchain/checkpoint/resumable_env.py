@@ -195,11 +195,10 @@ def describe_single_environment(env: gym.Env) -> str:
             names.append(stock_class(type(env)).__name__)
         env = env.env
     name = "without id" if spec is None else spec.id
+    kwargs = {} if spec is None else spec.kwargs
     # `render_mode` is for the eye; what cannot be described is left out
-    arguments = (
-        {} if spec is None else {key: describe_value(value) for key, value in spec.kwargs.items() if key != "render_mode"}
-    )
-    told = ", ".join(f"{key}={word}" for key, word in sorted(arguments.items()) if word is not None)
+    arguments = {key: describe_value(value) for key, value in kwargs.items() if key != "render_mode"}
+    told = ", ".join(f"{key}={text}" for key, text in sorted(arguments.items()) if text is not None)
     return f"{name}{f' with {told}' if told else ''} ({' '.join([*names, type(env).__name__])})"
 
 
