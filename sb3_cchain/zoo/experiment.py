@@ -183,9 +183,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         Copy what evaluations have left in the run folder that training goes on from. What is of later evaluations than the
         checkpoint will come again.
         """
-        for name in ("evaluations.npz", "best_model.zip"):
-            _copy_if_there(folder / name, f"{self.save_path}/{name}")
-        _copy_if_there(statistics_path(folder / "best_model.zip", self.env_name), f"{self.params_path}/vecnormalize.pkl")
+        best = folder / "best_model.zip"
+        for path in (folder / "evaluations.npz", best):
+            _copy_if_there(path, f"{self.save_path}/{path.name}")
+        if best.is_file():
+            _copy_if_there(statistics_path(best, self.env_name), f"{self.params_path}/vecnormalize.pkl")
 
     def _check_trained_agent(self) -> None:
         check_model_file(self.trained_agent)
