@@ -5,9 +5,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.distributions import CategoricalDistribution, Distribution
 from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
@@ -194,6 +194,41 @@ def test_policies_of_another_kind_are_those_of_the_base_without_churn_reduction(
 def test_policies_of_another_kind_hold_their_values_still(algorithm, kwargs):
     model = algorithm(WholePolicy, RandomEnv(), churn_target="value", **kwargs).learn(24)
     assert model.logger.name_to_value["churn/value_churn"] > 0
+
+
+class OwnPolicy(BasePolicy):
+    """Of SB3's, it has the base class of all policies alone, and a distribution."""
+
+    def __init__(self, observation_space, action_space, lr_schedule, use_sde=False, **kwargs):
+        super().__init__(observation_space, action_space, **kwargs)
+        (n_observations,) = observation_space.shape
+        self.actor, self.critic = nn.Linear(n_observations, int(action_space.n)), nn.Linear(n_observations, 1)
+        self.action_dist = CategoricalDistribution(int(action_space.n))
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
+
+    def get_distribution(self, obs):
+        return self.action_dist.proba_distribution(self.actor(obs))
+
+    def forward(self, obs, deterministic=False):
+        distribution = self.get_distribution(obs)
+        actions = distribution.get_actions(deterministic)
+        return actions, self.critic(obs), distribution.log_prob(actions)
+
+    def evaluate_actions(self, obs, actions):
+        distribution = self.get_distribution(obs)
+        return self.critic(obs), distribution.log_prob(actions), distribution.entropy()
+
+    def predict_values(self, obs):
+        return self.critic(obs)
+
+    def _predict(self, observation, deterministic=False):
+        return self.forward(observation, deterministic)[0]
+
+
+@EACH_ON_POLICY
+def test_policies_without_a_class_of_sb3s_are_held_still(algorithm, kwargs):
+    model = algorithm(OwnPolicy, RandomEnv(), **kwargs).learn(24)
+    assert model.logger.name_to_value["churn/loss"] > 0
 
 
 @EACH_ON_POLICY

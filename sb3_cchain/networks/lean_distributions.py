@@ -17,6 +17,7 @@ from stable_baselines3.common.distributions import (
     MultiCategoricalDistribution,
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.distributions import Bernoulli, Categorical, Normal
 
 from sb3_cchain.networks.compiled import uncompiled
@@ -177,8 +178,9 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     """
     Give a model lean action distributions. What it does, learns and saves stays the same, to the bit; it takes less time.
 
-    Nothing changes for a policy with a method of its own that makes or uses its distribution, and for distributions other than
-    SB3's categorical, multi-categorical, Bernoulli and diagonal Gaussian ones (gSDE, the maskable ones of sb3-contrib).
+    Nothing changes for a policy that is no ``ActorCriticPolicy``, or has a method of its own that makes or uses its
+    distribution, and for distributions other than SB3's categorical, multi-categorical, Bernoulli and diagonal Gaussian ones
+    (gSDE, the maskable ones of sb3-contrib).
 
     An action is never drawn from NaN, as with torch's distributions. Where it came from is said by a
     :class:`~sb3_cchain.algorithms.FiniteCheck` among the callbacks, which looks at the policy once per rollout.
@@ -187,6 +189,8 @@ def make_lean(model: OnPolicyModel) -> OnPolicyModel:
     :return: The same model
     """
     policy = uncompiled(model.policy)
+    if not isinstance(policy, ActorCriticPolicy):
+        return model
     # The very class: a subclass may do something else
     make = _LEAN.get(type(policy.action_dist))
     if make is not None and is_sb3s(policy.action_dist) and all(_is_method_of_sb3(getattr(policy, name)) for name in _METHODS):
