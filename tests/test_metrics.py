@@ -227,6 +227,21 @@ def test_a_task_that_comes_again_keeps_the_rows_of_its_first_visit(tmp_path):
     assert len(model.continual_returns) == 5
 
 
+class AlwaysEnds(BackAgain):
+    """The episodes of the second visit end, too."""
+
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, self.n_steps >= self.length, False, info
+
+
+def test_a_task_that_comes_again_has_its_row_after_that_of_the_task_before(tmp_path):
+    # The third rollout is of steps 48 to 72, with the switch from 1 to 0 at 64
+    path = tmp_path / "returns.csv"
+    PPO("MlpPolicy", AlwaysEnds(length=8), **{**SETTINGS, "n_steps": 24}).learn(72, ContinualMetrics(path))
+    assert [(row["timesteps"], row["task_id"]) for row in read_returns(path)] == [(24, 0), (48, 0), (48, 1), (72, 1), (72, 0)]
+
+
 def test_an_episode_that_a_switch_cuts_counts_where_others_ended(tmp_path):
     path = tmp_path / "returns.csv"
     env = ContinualEnv([lambda: CountEnv(length=10)] * 2, 16)

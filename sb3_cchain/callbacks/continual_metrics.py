@@ -189,7 +189,10 @@ class ContinualMetrics(BaseCallback):
             return []  # as between most steps of off-policy algorithms
         values = {task_id: (len(returns), float(np.mean(returns))) for task_id, returns in self._finished.items()}
         values.update({task_id: (0, reward) for task_id, reward in self._endless.items()})
-        new = [dict(zip(COLUMNS, (self.num_timesteps, task_id, *values[task_id]), strict=True)) for task_id in sorted(values)]
+        # The present task came last, also where it is a former one that has come back
+        present = self._state["task_id"]
+        tasks = sorted(values, key=lambda task_id: (task_id == present, task_id))
+        new = [dict(zip(COLUMNS, (self.num_timesteps, task_id, *values[task_id]), strict=True)) for task_id in tasks]
         self._finished.clear()
         self._endless.clear()
         self.rows += new
