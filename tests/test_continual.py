@@ -74,6 +74,13 @@ def test_recovery_times():
     assert continual.recovery_times(RETURNS[:4]).shape == (0,)
 
 
+def test_recovery_of_a_task_that_comes_back():
+    returns = [(0, 4.0), (0, 8.0), (1, 2.0), (1, 8.0), (1, 6.0), (0, 5.0), (0, 9.0)]
+    rows = [dict(timesteps=10 * i, task_id=task, n_episodes=1, mean_return=value) for i, (task, value) in enumerate(returns)]
+    # To 8, at step 30; to 6, at step 60
+    assert continual.recovery_times(rows, window=1).tolist() == [20, 20]
+
+
 def rows_of(before, after):
     rows = [dict(timesteps=0, trained_task=0, task_id=i, mean_return=value) for i, value in enumerate(before)]
     for j, values in enumerate(after):

@@ -14,7 +14,7 @@ https://arxiv.org/abs/1706.08840).
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
@@ -107,15 +107,15 @@ def recovery_times(rows: Sequence[Mapping[str, float]], window: int = 5, toleran
     :param rows: Rows of ``returns.csv``
     :param window: The level to reach is the mean of so many last rollouts of the task before
     :param tolerance: How much less than that suffices
-    :return: The time of each switch, ``(n_tasks - 1,)``; NaN where the level was not reached within the task
+    :return: The time of each switch, ``(n_switches,)``; NaN where the level was not reached within the task
     """
-    tasks = list(dict.fromkeys(int(row["task_id"]) for row in rows))
+    # A task that comes back has several parts
+    parts = [list(part) for _, part in groupby(rows, key=lambda row: row["task_id"])]
     times = []
-    for before, after in pairwise(tasks):
-        old_steps, old_returns = task_curve(rows, before)
-        steps, returns = task_curve(rows, after)
-        reached = steps[returns >= old_returns[-window:].mean() - tolerance]
-        times.append(reached[0] - old_steps[-1] if len(reached) else np.nan)
+    for before, after in pairwise(parts):
+        level = np.mean([row["mean_return"] for row in before[-window:]]) - tolerance
+        reached = [row["timesteps"] for row in after if row["mean_return"] >= level]
+        times.append(reached[0] - before[-1]["timesteps"] if reached else np.nan)
     return np.array(times, dtype=float)
 
 
