@@ -154,7 +154,8 @@ CHECKS = (
     Check(
         *("diverged_values", "The values are greater than any return", "value_excess", "above", 3, "likely"),
         "The greatest value, divided by the greatest that rewards as large as those met can add up to. Values beyond it were "
-        "made by bootstrapping from themselves.",
+        "made by bootstrapping from themselves or, of SAC, TQC and CrossQ, by an entropy bonus that is large beside the "
+        "rewards.",
         "van Hasselt et al. (2018), arXiv 1812.02648, count values above 1 as diverged; 3 leaves room for rewards not met",
         (r.SLOW_TARGET, r.DOUBLE_DQN, r.SMALLER_RATE, r.LAYER_NORM_DQN, r.CCHAIN),
     ),

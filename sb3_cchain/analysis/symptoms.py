@@ -235,7 +235,8 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
     - ``value_excess``: the greatest :math:`|V|`, divided by :math:`\max |r| / (1 - \gamma)`, which no true value exceeds. Only
       off-policy: the rewards of a rollout include what SB3 adds where a time limit ends an episode. With ``n_steps`` above 1,
       the buffer gives sums of rewards :math:`R` and discounts :math:`\gamma^n`, and the bound is
-      :math:`\max (|R| / (1 - \gamma^n))`.
+      :math:`\max (|R| / (1 - \gamma^n))`. The entropy bonus of SAC, TQC and CrossQ is not in the bound: where it is large
+      beside the rewards, true values exceed it.
 
     Rewards and values are as the algorithm sees them, after any normalisation.
 
