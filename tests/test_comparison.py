@@ -94,6 +94,12 @@ def test_table_by_hand():
     ]
 
 
+@pytest.mark.parametrize("methods", [{}, {"PPO": []}, {"PPO": [], "other": [run_with([1.0])]}], ids=["none", "one", "two"])
+def test_a_method_without_a_run_is_refused(methods):
+    with pytest.raises(ValueError, match="Each method must have at least one run; got, by label"):
+        comparison_table(methods)
+
+
 def test_table_of_one_method_has_no_difference():
     assert [row[0] for row in cells(comparison_table({"PPO": [run_with([1.0])]}))] == ["runs", "0", "J(T)", "95 % interval"]
 

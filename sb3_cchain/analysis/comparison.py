@@ -47,8 +47,11 @@ def common_tasks(methods: Methods) -> list[int]:
     """
     :param methods: By label, the rows of ``returns.csv`` of each run
     :return: The tasks that all runs have comparable returns on, in their order
-    :raises ValueError: When there is none
+    :raises ValueError: When there is none, or a method has no run
     """
+    n_runs = {label: len(runs) for label, runs in methods.items()}
+    if not n_runs or 0 in n_runs.values():
+        raise ValueError(f"Each method must have at least one run; got, by label, {n_runs}")
     tasks = [list(dict.fromkeys(int(row["task_id"]) for row in rows)) for runs in methods.values() for rows in runs]
     mixed = mixed_tasks(methods)
     common = [task for task in tasks[0] if task not in mixed and all(task in others for others in tasks)]
@@ -65,7 +68,7 @@ def comparison_table(methods: Methods) -> Table:
         :math:`J(\mathbb{T})`, their mean: its mean over the runs with its 95 % interval, by Student's t, and how much more it
         is than that of the first method, by Welch's t-test. There are no intervals for a single run, or where all runs are
         alike
-    :raises ValueError: When the runs have no task in common
+    :raises ValueError: When the runs have no task in common, or a method has no run
     :raises ImportError: Without SciPy
     """
     tasks = common_tasks(methods)
