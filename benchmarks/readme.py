@@ -11,7 +11,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.grid.results import read_results
+from benchmarks.grid.results import Result, read_results
 from benchmarks.grid.run import ROOT, short_name, suite_lines
 from benchmarks.grid.suites import SUITES
 from benchmarks.number_text import thousands, with_error
@@ -20,7 +20,7 @@ from benchmarks.report.collapses import COLLAPSED, collapses, collapses_table
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
 from benchmarks.report.places import write_tables
-from benchmarks.report.tables import method_label
+from benchmarks.report.tables import method_label, table_methods
 from benchmarks.report.task_tables import MISSING, returns_header, returns_rows
 from sb3_cchain.analysis.curves import smoothed
 from sb3_cchain.analysis.plots import import_matplotlib
@@ -66,7 +66,7 @@ def readme_table(cells: Cells) -> str:
         for method in ("vanilla", "cchain")
     }
     (ppo, ppo_tasks), (cchain, cchain_tasks) = counts["vanilla"], counts["cchain"]
-    names = ", ".join(short_name(env_id).split("-")[0] for env_id in COLLAPSED)
+    names = ", ".join(map(_game, COLLAPSED))
     sentence = (
         f"{names}: PPO has collapsed at the end of {ppo} of {ppo_tasks} tasks after a switch, "
         f"C-CHAIN PPO of {cchain} of {cchain_tasks}."
@@ -77,19 +77,43 @@ def readme_table(cells: Cells) -> str:
 def documentation_tables(results: Path) -> dict[str, str]:
     """
     :param results: Folder of all results
-    :return: The tables of the documentation, by their names: a table for each environment of the mean return of each run on
-        each task, and of the policy churn in its first iteration
+    :return: The tables of the documentation, by their names: J(T) of all methods; for each environment the mean return of
+        each run on each task; and the policy churn in the first iteration of each task
     """
     runs, _ = read_results(results / BUDGET / SUITE)
     lines = suite_lines(SUITE, {run.line for run in runs})
-    returns, churn = [], []
+    tables, churn = {"gym_control_scores": scores_table(runs)}, []
     for env_id in SUITES[SUITE].env_ids:
         here, name = [run for run in runs if run.env_id == env_id], short_name(env_id)
         header = returns_header([str(task) for task in range(here[0].n_tasks)])
-        returns.append(f"{name}:\n\n{markdown_table(header, returns_rows(here, lines, digits=0))}")
+        tables[f"{_game(env_id).lower()}_tasks"] = markdown_table(header, returns_rows(here, lines, digits=0))
         if env_id in COLLAPSED:
             churn.append(f"{name}:\n\n{collapses_table(here, lines)}")
-    return {"gym_control_tasks": "\n\n".join(returns), "gym_control_collapses": "\n\n".join(churn)}
+    return {**tables, "gym_control_collapses": "\n\n".join(churn)}
+
+
+def scores_table(runs: Sequence[Result]) -> str:
+    """
+    :param runs: Runs of the suite
+    :return: For each method J(T) in each environment, here and in the paper
+    """
+    cells, _ = make_cells(runs)
+    paper, env_ids = read_tables()[SUITE], SUITES[SUITE].env_ids
+    header = ["J(T)", *(name for env_id in env_ids for name in (_game(env_id), "paper"))]
+    rows = []
+    for method in table_methods(cells, paper):
+        row = [method_label(SUITE, method)]
+        for env_id in env_ids:
+            figure = paper.figures.get((env_id, method))
+            printed = MISSING if figure is None else with_error(figure.mean, figure.standard_error, 0)
+            row += [_score(cells.get((env_id, method))), printed]
+        rows.append(row)
+    return markdown_table(header, rows)
+
+
+def _game(env_id: str) -> str:
+    """The name of an environment without its version."""
+    return short_name(env_id).split("-")[0]
 
 
 def _score(cell: Cell | None) -> str:

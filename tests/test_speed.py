@@ -218,7 +218,11 @@ def test_each_table_has_one_place_in_the_documentation():
         "made_with",
         "gpu",
         "shelf",
-        "gym_control_tasks",
+        "gym_control_scores",
+        "cartpole_tasks",
+        "acrobot_tasks",
+        "lunarlander_tasks",
+        "mountaincar_tasks",
         "gym_control_collapses",
         *(f"supervised_{name}" for name in PROBLEMS),
     ]
