@@ -38,7 +38,7 @@ def save_checkpoint(folder, num_timesteps):
     checkpoint = folder / "algo" / "env_1" / "checkpoints" / f"step_{num_timesteps:012d}"
     checkpoint.mkdir(parents=True)
     # Which takes longer to import than most of these processes live
-    from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, write_info
+    from sb3_cchain.checkpoint.checkpoint_info import FORMAT, write_info
 
     info = {"format": FORMAT, "num_timesteps": num_timesteps, "seconds": 100.0, "files": {}, "chunks": [], "versions": {}}
     write_info(checkpoint, info)

@@ -31,7 +31,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_cchain import CChainCallback, CChainPPO, ChurnMonitor, TaskSignal, TrainingCheckpoint, resume
 from sb3_cchain.checkpoint import ResumableEnv, checkpoint_folder, find_checkpoint, load_model, training_checkpoint
-from sb3_cchain.checkpoint.checkpoint_folder import FORMAT, CheckpointFolder, write_info
+from sb3_cchain.checkpoint.checkpoint_folder import CheckpointFolder
+from sb3_cchain.checkpoint.checkpoint_info import FORMAT, write_info
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.locked_file import open_locked
 from tests.resume_cases import Record, Stop, Stopped, in_new_process

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 from benchmarks.grid.run import Run
 from sb3_cchain.checkpoint import write_safely
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, is_being_written, step_folders
+from sb3_cchain.checkpoint.checkpoint_folder import is_being_written
+from sb3_cchain.checkpoint.saved_checkpoint import Checkpoint, step_folders
 
 # Packages whose versions are recorded
 PACKAGES = ("sb3-cchain", "stable-baselines3", "gymnasium", "torch")

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 
 from sb3_cchain.analysis.saved_algorithm import algorithm_of
 from sb3_cchain.checkpoint import check_model_file, load_statistics
-from sb3_cchain.checkpoint.checkpoint_folder import MODEL
+from sb3_cchain.checkpoint.checkpoint_info import MODEL
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS
 from sb3_cchain.zoo.settings import read_saved
 from sb3_cchain.zoo.statistics import statistics_beside

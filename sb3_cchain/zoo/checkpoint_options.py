@@ -10,8 +10,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint, find_checkpoint, has_checkpoint, is_being_written
+from sb3_cchain.checkpoint.checkpoint_folder import is_being_written
 from sb3_cchain.checkpoint.files import write_safely
+from sb3_cchain.checkpoint.saved_checkpoint import Checkpoint, find_checkpoint, has_checkpoint
 from sb3_cchain.zoo.rl_zoo_options import read_rl_zoo_options
 from sb3_cchain.zoo.training_record import COMMAND, read_record
 

@@ -36,9 +36,9 @@ from sb3_cchain.checkpoint import (
     saved_timesteps,
     write_safely,
 )
-from sb3_cchain.checkpoint.checkpoint_folder import Checkpoint
 from sb3_cchain.checkpoint.model_files import save_statistics
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
+from sb3_cchain.checkpoint.saved_checkpoint import Checkpoint
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods.registry import BY_ALGO

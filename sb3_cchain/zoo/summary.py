@@ -18,7 +18,7 @@ from sb3_cchain.callbacks import task_averages
 from sb3_cchain.callbacks.log_folder import log_folder
 from sb3_cchain.callbacks.returns_file import RETURNS_CSV
 from sb3_cchain.callbacks.task_progress_bar import as_clock
-from sb3_cchain.checkpoint.checkpoint_folder import step_folders
+from sb3_cchain.checkpoint.saved_checkpoint import step_folders
 from sb3_cchain.tasks.clock import TaskClock
 from sb3_cchain.tasks.continual import is_continual
 from sb3_cchain.tasks.names import task_names
