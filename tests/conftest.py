@@ -1,4 +1,5 @@
 import multiprocessing
+import os
 import signal
 from contextlib import suppress
 
@@ -13,6 +14,12 @@ multiprocessing.set_forkserver_preload(["tests.resume_preload"])
 
 with suppress(ImportError):  # before dm_control, which tests import; see sb3_cchain/envs/dm_control.py
     import triton  # noqa: F401
+
+
+@pytest.fixture(autouse=True, scope="session")
+def folder_of_loggers(tmp_path_factory):
+    """Of models that log to none. Otherwise SB3 makes one for each of them in the system's temporary folder, where it stays."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3_logs"))
 
 
 @pytest.fixture(autouse=True)
