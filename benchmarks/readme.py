@@ -10,6 +10,7 @@ Control. Trains nothing.
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 from benchmarks.grid.results import Result, read_results
 from benchmarks.grid.run import ROOT, short_name, suite_lines
@@ -19,7 +20,7 @@ from benchmarks.report.cells import Cell, Cells, make_cells
 from benchmarks.report.collapses import COLLAPSED, collapses, collapses_table
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import read_tables
-from benchmarks.report.places import write_tables
+from benchmarks.report.places import LINE_LENGTH, write_tables
 from benchmarks.report.tables import method_label, table_methods
 from benchmarks.report.task_tables import MISSING, returns_header, returns_rows
 from sb3_cchain.analysis.curves import smoothed
@@ -52,26 +53,24 @@ def readme_table(cells: Cells) -> str:
     paper = read_tables()[SUITE]
     rows = []
     for env_id in SUITES[SUITE].env_ids:
-        here = [cells.get((env_id, method)) for method in METHODS]
-        done = [cell for cell in here if cell is not None]
+        here = [cells[env_id, method] for method in METHODS]
         figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
-        lengths = f"{done[0].results[0].n_tasks} × {thousands(done[0].results[0].steps_per_task)}"
-        n_seeds = ", ".join(map(str, sorted({len(cell.seeds) for cell in done})))
+        lengths = f"{here[0].results[0].n_tasks} × {thousands(here[0].results[0].steps_per_task)}"
+        n_seeds = ", ".join(map(str, sorted({len(cell.seeds) for cell in here})))
         printed = [with_error(figure.mean, figure.standard_error, 0) for figure in figures]
         rows.append([short_name(env_id), lengths, n_seeds, *map(_score, here), *printed])
     labels = [method_label(SUITE, method) for method in METHODS]
     header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
     counts = {
-        method: collapses([result for env_id in COLLAPSED for result in cells[env_id, method].results])
-        for method in ("vanilla", "cchain")
+        method: collapses([result for env_id in COLLAPSED for result in cells[env_id, method].results]) for method in METHODS
     }
-    (ppo, ppo_tasks), (cchain, cchain_tasks) = counts["vanilla"], counts["cchain"]
+    ends = {method: f"{collapsed} of {tasks}" for method, (collapsed, tasks) in counts.items()}
     names = ", ".join(map(_game, COLLAPSED))
     sentence = (
-        f"{names}: PPO has collapsed at the end of {ppo} of {ppo_tasks} tasks after a switch, "
-        f"C-CHAIN PPO of {cchain} of {cchain_tasks}."
+        f"{names}: PPO has collapsed at the end of {ends['vanilla']} tasks after a switch, C-CHAIN PPO of {ends['cchain']}, "
+        f"Oracle of {ends['oracle']}: the policy repeats one action."
     )
-    return f"{markdown_table(header, rows)}\n\n{sentence}"
+    return f"{markdown_table(header, rows)}\n\n{fill(sentence, LINE_LENGTH)}"
 
 
 def documentation_tables(results: Path) -> dict[str, str]:
@@ -141,8 +140,7 @@ def plot(cells: Cells, path: Path) -> None:
                 panel.plot(steps, smoothed(returns, 10), color=f"C{index}", label=label)
         for end in results[0].task_boundaries[:-1]:
             panel.axvline(end, color="0.35", linestyle="--", linewidth=1)
-        if (PICTURED, "oracle") in cells:
-            panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
+        panel.axhline(cells[PICTURED, "oracle"].mean, color="black", linestyle=":", linewidth=1, label="Oracle, mean")
         panel.set_title(title, fontsize="medium", fontweight="bold")
         panel.xaxis.set_major_locator(matplotlib.ticker.MultipleLocator(400_000))
         panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
@@ -162,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--write", action="store_true", help="Put tables and picture into README and documentation")
     args = parser.parse_args(arguments)
     cells = read_cells(args.results)
-    missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in TITLES if (env_id, method) not in cells]
+    missing = [f"{env_id} {method}" for env_id in SUITES[SUITE].env_ids for method in METHODS if (env_id, method) not in cells]
     if missing:
         parser.error(f"--results must have runs of {', '.join(missing)}; there are none in {args.results}")
     table, others = readme_table(cells), documentation_tables(args.results)

@@ -18,7 +18,7 @@ with suppress(ImportError):  # before dm_control, which tests import; see sb3_cc
 
 @pytest.fixture(autouse=True, scope="session")
 def folder_of_loggers(tmp_path_factory):
-    """Of models that log to none. Otherwise SB3 makes one for each of them in the system's temporary folder, where it stays."""
+    """Of models that log to none. Otherwise SB3 makes one for each in the system's temporary folder, where it stays."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3_logs"))
 
 

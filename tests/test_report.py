@@ -522,12 +522,17 @@ def test_where_a_policy_has_collapsed_and_with_which_churn_it_began(tmp_path):
     # The mean of the last ten rollouts counts: a single return of -400 is no collapse. Each value is logged a rollout late
     churn = [(120, "churn/policy_churn", 0.25), (130, "churn/policy_churn", 1.0)]
     write(tmp_path, "cchain", [[-400] * 12, [-100] * 9 + [-400]], metrics=churn)
-    write(tmp_path, "cchain", [[-90] * 12, [-90, -90] + [-400] * 10], seed=1, metrics=[(120, "churn/policy_churn", 2e-9)])
+    churn = [(step, "churn/policy_churn", value) for step, value in ((120, 2e-8), (130, 0.0), (140, 0.0))]
+    write(tmp_path, "cchain", [[-90] * 12, [-90, -90] + [-400] * 10], seed=1, metrics=churn)
+    # As low, but the policy changes
+    churn = [(step, "churn/policy_churn", value) for step, value in ((120, 2e-8), (130, 3e-6), (140, 2e-6))]
+    write(tmp_path, "cchain", [[-90] * 12, [-400] * 12], seed=2, metrics=churn)
     write(tmp_path, "vanilla", [[-90] * 12, [-400] * 12])
     results = whole_results(tmp_path)
-    assert collapses(results) == (2, 3)
+    assert collapses(results) == (2, 4)
     assert collapses_table(results, GYM_LINES) == markdown_table(
-        ["method", "seed", "1"], [["C-CHAIN PPO", "0", "0.2"], ["C-CHAIN PPO", "1", "**2e-09**"]]
+        ["method", "seed", "1"],
+        [["C-CHAIN PPO", "0", "0.2"], ["C-CHAIN PPO", "1", "**2e-08**"], ["C-CHAIN PPO", "2", "2e-08"]],
     )
 
 
