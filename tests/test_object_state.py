@@ -14,12 +14,8 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_cchain.checkpoint.object_state import (
-    NotSaved,
-    object_states,
-    register_state,
-    restore_objects,
-)
+from sb3_cchain.checkpoint.object_state import object_states, register_state, restore_objects
+from sb3_cchain.checkpoint.state_pickle import NotSaved
 
 
 class Thing:

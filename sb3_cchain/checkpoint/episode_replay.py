@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cchain.checkpoint.object_state import ObjectStates, object_states, restore_objects, stock_class
+from sb3_cchain.checkpoint.named_code import stock_class
+from sb3_cchain.checkpoint.object_state import ObjectStates, object_states, restore_objects
 from sb3_cchain.envs.reset import reset_env
 
 # How environments and wrappers were made

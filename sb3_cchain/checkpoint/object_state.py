@@ -10,9 +10,7 @@ An object that knows better what its state is has the methods ``state_dict()`` a
 modules and optimisers have. Its attributes are not looked at then.
 """
 
-import importlib
 import io
-import math
 import pickle
 import random
 from collections import Counter
@@ -27,9 +25,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils import EzPickle
-from numpy.typing import NDArray
 from stable_baselines3.common.monitor import ResultsWriter
+
+from sb3_cchain.checkpoint.named_code import find_named, name_in_module, stock_class
+from sb3_cchain.checkpoint.state_pickle import NotSaved, StatePickler, StateUnpickler, memory_owner
 
 # They belong to the process: how something was made, and what writes files
 KEPT = (ModuleType, property, EnvSpec, ResultsWriter)
@@ -43,10 +42,6 @@ DISPLAYS = frozenset({"pygame", "glfw", "OpenGL", "matplotlib"})
 
 # What changes in a space: the random numbers of its samples
 SPACE_STATE = ("_np_random", "spaces")
-
-
-class NotSaved(ValueError):
-    """An attribute that a state needs cannot be saved."""
 
 
 class Entry(NamedTuple):
@@ -251,7 +246,7 @@ class _Reader:
         elif isinstance(value, spaces.Space) or (not _is_data(value) and self._is_of_state(owner, value)):
             self._enter(owner, name, value, _kind_name(value))
         elif isinstance(value, np.ndarray):
-            self._n_arrays[id(_owner(value))] += 1
+            self._n_arrays[id(memory_owner(value))] += 1
         elif not is_whole and not _is_data(value):
             self._left_out.append(self._path(owner, name))
             return False
@@ -317,91 +312,6 @@ class _Reader:
         return file.getvalue()
 
 
-class StatePickler(pickle.Pickler):
-    """
-    Refers to objects whose state is kept elsewhere, saves of a tensor no more than the tensor, and keeps the memory layout of
-    arrays.
-
-    :param file: Where it writes
-    :param references: How to refer to these objects, by their ids
-    :param shared: Ids of arrays, views of which stay views
-    :param kwargs: Arguments of ``pickle.Pickler``
-    """
-
-    def __init__(
-        self,
-        file: Any,
-        references: Mapping[int, str] | Mapping[int, str | int],
-        shared: Collection[int] = (),
-        **kwargs: Any,
-    ):
-        super().__init__(file, protocol=5, **kwargs)
-        self._references = references
-        self._shared = shared
-
-    def persistent_id(self, value: Any) -> str | int | None:
-        """See ``pickle.Pickler``."""
-        return self._references.get(id(value))
-
-    def reducer_override(self, value: Any) -> Any:
-        """See ``pickle.Pickler``."""
-        if type(value) is np.ndarray:
-            owner = _owner(value)
-            if owner is not value and id(owner) in self._shared:
-                return np.ndarray, (value.shape, value.dtype, owner, _address(value) - _address(owner), value.strides)
-            return _transposed(value) if _is_transposed(value) else NotImplemented
-        if isinstance(value, EzPickle):
-            # Gymnasium pickles how they were made, not their state
-            raise NotSaved(f"it contains {value}, whose state pickle does not save")
-        if not isinstance(value, th.Tensor):
-            return NotImplemented
-        if not value.is_leaf:
-            value = value.detach()
-        if value.untyped_storage().nbytes() > value.nbytes:
-            value = value.clone()
-        return value.__reduce_ex__(5)
-
-
-class StateUnpickler(pickle.Unpickler):
-    """
-    Reads what :class:`StatePickler` wrote.
-
-    :param file: Where it reads
-    :param objects: The objects by how they are referred to
-    :param kwargs: Arguments of ``pickle.Unpickler``
-    """
-
-    def __init__(self, file: Any, objects: Mapping[Any, object], **kwargs: Any):
-        super().__init__(file, **kwargs)
-        self._objects = objects
-
-    def persistent_load(self, reference: Any) -> object:
-        """See ``pickle.Unpickler``."""
-        return self._objects[reference]
-
-
-def _owner(array: NDArray[Any]) -> NDArray[Any]:
-    """The array that the memory belongs to, if it can be asked for a part of it; otherwise the array itself."""
-    base = array.base
-    return base if isinstance(base, np.ndarray) and base.flags.c_contiguous and not base.dtype.hasobject else array
-
-
-def _address(array: NDArray[Any]) -> int:
-    return array.__array_interface__["data"][0]
-
-
-def _is_transposed(array: NDArray[Any]) -> bool:
-    """Whether axes have another order in memory, as those of transposed images. An axis of length 1 has a place there, too."""
-    compact = [array.itemsize * math.prod(array.shape[axis + 1 :]) for axis in range(array.ndim)]
-    return array.size > 0 and list(array.strides) != compact and not array.flags.fnc
-
-
-def _transposed(array: NDArray[Any]) -> Any:
-    # Pickle would lay it out otherwise, and convolutions round otherwise then
-    order = sorted(range(array.ndim), key=lambda axis: (-abs(array.strides[axis]), array.shape[axis] == 1))
-    return np.transpose, (np.array(array.transpose(order), order="C"), np.argsort(order).tolist())
-
-
 def _is_data(value: object) -> bool:
     return isinstance(value, (*DATA, *CODE, io.IOBase)) or not hasattr(value, "__dict__")
 
@@ -447,36 +357,6 @@ def _package(kind: type) -> str:
     return str(getattr(kind, "__module__", "")).partition(".")[0]  # some classes of C extensions have none
 
 
-def stock_class(kind: type) -> type:
-    """
-    :param kind: A class
-    :return: It, or Gymnasium's ``TimeLimit`` for the one that RL Zoo puts in its place as soon as it is imported
-    """
-    return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
-
-
 def _kind_name(value: object) -> str:
     # A generator can take the state of another one with the same algorithm
     return name_in_module(stock_class(type(value.bit_generator if isinstance(value, np.random.Generator) else value)))
-
-
-def name_in_module(named: Any) -> str:
-    """
-    :param named: A class or a function
-    :return: What :func:`find_named` finds it by, ``"module:Class"``
-    """
-    return f"{named.__module__}:{named.__qualname__}"
-
-
-def find_named(name: str) -> Any:
-    """
-    :param name: Name of a class or a function, ``"module:Class"``
-    :return: What has this name
-    :raises AttributeError: When nothing has
-    :raises ImportError: When its module cannot be imported
-    """
-    module, _, qualified = name.partition(":")
-    found: Any = importlib.import_module(module)
-    for part in qualified.split("."):
-        found = getattr(found, part)
-    return found

@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_cchain.checkpoint.chunks import ChunkStore
-from sb3_cchain.checkpoint.object_state import StatePickler, StateUnpickler
+from sb3_cchain.checkpoint.state_pickle import StatePickler, StateUnpickler
 
 # Smaller arrays are not worth a file
 SMALLEST = 2**16

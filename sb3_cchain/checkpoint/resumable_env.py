@@ -12,16 +12,11 @@ from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_cchain.checkpoint.episode_replay import CONSTRUCTION, EpisodeReplay
-from sb3_cchain.checkpoint.object_state import (
-    NotSaved,
-    ObjectStates,
-    is_stream,
-    object_states,
-    restore_objects,
-    stock_class,
-)
+from sb3_cchain.checkpoint.named_code import stock_class
+from sb3_cchain.checkpoint.object_state import ObjectStates, is_stream, object_states, restore_objects
 from sb3_cchain.checkpoint.random_state import random_state, restore_random_state
 from sb3_cchain.checkpoint.simulator_state import emptied, is_inexact, register_simulators
+from sb3_cchain.checkpoint.state_pickle import NotSaved
 from sb3_cchain.checkpoint.value_description import describe_value
 from sb3_cchain.envs.continual_env import ContinualEnv
 from sb3_cchain.envs.reset import reset_env

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cchain.checkpoint.log import further_logger
-from sb3_cchain.checkpoint.object_state import find_named
+from sb3_cchain.checkpoint.named_code import find_named
 from sb3_cchain.checkpoint.saved_checkpoint import Checkpoint, find_checkpoint
 from sb3_cchain.checkpoint.training_checkpoint import TrainingCheckpoint
 from sb3_cchain.tasks.callback_tree import as_list, iterate_callbacks

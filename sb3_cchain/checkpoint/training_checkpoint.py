@@ -24,8 +24,8 @@ from sb3_cchain.checkpoint.environment_processes import live_as_long_as_training
 from sb3_cchain.checkpoint.environment_state import can_save_environment, prepare_environment
 from sb3_cchain.checkpoint.files import sync_files
 from sb3_cchain.checkpoint.log import describe_log
+from sb3_cchain.checkpoint.named_code import find_named, name_in_module
 from sb3_cchain.checkpoint.new_episodes import begin_new_episodes, lasting_state
-from sb3_cchain.checkpoint.object_state import find_named, name_in_module
 from sb3_cchain.checkpoint.saved_checkpoint import Checkpoint, has_checkpoint
 from sb3_cchain.checkpoint.training_description import check_same, describe_callbacks, describe_env, describe_model
 from sb3_cchain.checkpoint.training_state import chunk_names, restore_training, training_parts, training_state
