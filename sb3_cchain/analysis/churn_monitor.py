@@ -18,7 +18,7 @@ from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.networks.algorithm_kinds import is_trpo
 from sb3_cchain.networks.batch_outputs import Batch
 from sb3_cchain.networks.model_optimizers import model_optimizers
-from sb3_cchain.tasks.callback_tree import require_unchanged_network
+from sb3_cchain.tasks.callback_tree import require_every_rollout, require_unchanged_network
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 
@@ -99,6 +99,7 @@ class ChurnMonitor(BaseCallback):
         known_kind(self.model)  # raises for an algorithm that is not known
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         require_unchanged_network(self)
         self._hooks.begin(self.model)
         self._window = {}  # may be left from training that was interrupted

@@ -24,7 +24,7 @@ from sb3_cchain.checkpoint.random_state import unchanged_random_state
 from sb3_cchain.checkpoint.resumable_env import ResumableEnv
 from sb3_cchain.envs import TaskCaption
 from sb3_cchain.masked_evaluation import evaluate_policy
-from sb3_cchain.tasks.callback_tree import require_single, require_unchanged_network
+from sb3_cchain.tasks.callback_tree import require_every_rollout, require_single, require_unchanged_network
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_same_tasks
 from sb3_cchain.tasks.signal import TASK_KEY, TaskSwitch, active_signal, first_reset_info
@@ -101,6 +101,7 @@ class TaskEvaluation(BaseCallback):
         check_same_tasks(self.training_env, self.eval_env)
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         require_single(self)
         require_unchanged_network(self)
         warn_without_sync(self)

@@ -4,6 +4,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_cchain.tasks.callback_tree import require_every_rollout
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_number
 
@@ -36,6 +37,7 @@ class TrainingInterval(BaseCallback):
             raise TypeError(f"{name} is for on-policy and off-policy algorithms, got {algorithm}")
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         add_overview(self.model)
         on_policy = isinstance(self.model, OnPolicyAlgorithm)
         self._interval = self.interval or self._defaults[0 if on_policy else 1]

@@ -3,6 +3,8 @@
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_cchain.tasks.callback_tree import require_every_rollout
+
 
 class RolloutNormalizedAdvantage(BaseCallback):
     """
@@ -18,6 +20,9 @@ class RolloutNormalizedAdvantage(BaseCallback):
             raise TypeError(f"{name} is for on-policy algorithms, got {type(self.model).__name__}")
         if getattr(self.model, "normalize_advantage", False):
             raise ValueError(f"{name} normalises the advantages itself: set `normalize_advantage=False`, got True")
+
+    def _on_training_start(self) -> None:
+        require_every_rollout(self)
 
     def _on_step(self) -> bool:
         return True

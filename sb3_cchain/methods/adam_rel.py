@@ -8,6 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tasks.callback_tree import require_every_rollout
 from sb3_cchain.tensorboard.layout import add_charts
 
 _NO_STEP_COUNT = "AdamRel needs an optimiser with a step count, as Adam has, got {}"
@@ -53,6 +54,9 @@ class AdamRel(BaseCallback):
             if not all("betas" in group for group in optimizer.param_groups):
                 raise TypeError(_NO_STEP_COUNT.format(type(optimizer).__name__))
         self._n_target_updates = self._count_target_updates()
+
+    def _on_training_start(self) -> None:
+        require_every_rollout(self)
 
     def _count_target_updates(self) -> int:
         model: Any = self.model

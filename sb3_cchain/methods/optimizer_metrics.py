@@ -6,6 +6,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_cchain.methods.optimizer_wrapper import OptimizerWrapper
 from sb3_cchain.methods.output_layers import check_output_layers
 from sb3_cchain.networks.model_optimizers import model_optimizers
+from sb3_cchain.tasks.callback_tree import require_every_rollout
 
 
 class OptimizerMetrics(BaseCallback):
@@ -29,6 +30,9 @@ class OptimizerMetrics(BaseCallback):
                 f"{type(self.model).__name__} has {names or 'none'}"
             )
         check_output_layers(self.model)
+
+    def _on_training_start(self) -> None:
+        require_every_rollout(self)
 
     def _on_step(self) -> bool:
         # Off-policy rollouts are a few steps long

@@ -8,6 +8,7 @@ from sb3_cchain.methods.fresh_policy import fresh_policy
 from sb3_cchain.networks.compiled import uncompiled
 from sb3_cchain.networks.injection_policies import Injectable, InjectionDQNPolicy, InjectionPolicy
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tasks.callback_tree import require_every_rollout
 from sb3_cchain.tensorboard.layout import add_charts
 from sb3_cchain.validation import check_number
 
@@ -65,6 +66,7 @@ class PlasticityInjection(TaskBoundary):
             )
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         if self.timestep is None:
             super()._on_training_start()
 

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from sb3_cchain.methods.churn_reducers import forget_references
 from sb3_cchain.tasks.boundary import TaskBoundary
+from sb3_cchain.tasks.callback_tree import require_every_rollout
 from sb3_cchain.validation import check_number
 
 
@@ -31,6 +32,7 @@ class SwitchOrInterval(TaskBoundary):
         self.interval = interval
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         self.n_resets: int = 0
         if self.interval is None:
             super()._on_training_start()

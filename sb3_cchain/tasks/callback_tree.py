@@ -48,6 +48,19 @@ def require_single(callback: BaseCallback) -> None:
         raise ValueError(f"`learn()` was given {n_callbacks} callbacks {kind.__name__}: give it one")
 
 
+def require_every_rollout(callback: BaseCallback) -> None:
+    """
+    :param callback: A callback that acts between rollouts, when training starts
+    :raises ValueError: When another one holds it that calls it at its events alone, and never between rollouts
+    """
+    for given in iterate_callbacks(callback.locals.get("callback")):
+        if isinstance(given, EventCallback) and any(held is callback for held in iterate_callbacks(given.callback)):
+            raise ValueError(
+                f"{type(callback).__name__} must be called at every rollout, but {type(given).__name__} holds it: "
+                "give it to `learn()` beside the other callbacks"
+            )
+
+
 def require_unchanged_network(callback: BaseCallback) -> None:
     """
     :param callback: A callback that looks at the network between rollouts, when training starts

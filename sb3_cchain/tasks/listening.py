@@ -4,7 +4,7 @@ import warnings
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_single, will_be_restored
+from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_every_rollout, require_single, will_be_restored
 from sb3_cchain.tasks.continual import require_continual
 from sb3_cchain.tasks.signal import active_signal, episode_task
 from sb3_cchain.tasks.sync import warn_without_sync
@@ -17,8 +17,10 @@ def start_listening(callback: BaseCallback, needs_switches: bool = True) -> None
     :param needs_switches: Whether it is of no use where the task cannot switch
     :raises TypeError: With ``needs_switches``, when there cannot be a switch: there is no :class:`~sb3_cchain.TaskSignal`, the
         environment is not continual, and this call of ``learn()`` begins training anew
-    :raises ValueError: When ``learn()`` was given several callbacks of its class, or a TaskSignal behind it
+    :raises ValueError: When ``learn()`` was given several callbacks of its class, or a TaskSignal behind it, or when
+        another callback holds it, see :func:`~sb3_cchain.tasks.callback_tree.require_every_rollout`
     """
+    require_every_rollout(callback)
     given = list(iterate_callbacks(callback.locals.get("callback")))
     has_signal = any(isinstance(other, TaskSignal) for other in given)
     if needs_switches and not has_signal:

@@ -5,7 +5,7 @@ import warnings
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cchain.tasks.callback_tree import iterate_callbacks, will_be_restored
+from sb3_cchain.tasks.callback_tree import iterate_callbacks, require_every_rollout, will_be_restored
 from sb3_cchain.tasks.continual import is_continual, require_continual
 from sb3_cchain.tasks.evaluation import check_apart, check_same_tasks, evaluate_on, find_eval_envs
 from sb3_cchain.tasks.reset import reset_training_env
@@ -34,6 +34,7 @@ class TaskSync(BaseCallback):
     """
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         require_continual(self)
         eval_envs = find_eval_envs(self.locals.get("callback"))
         env = self.training_env

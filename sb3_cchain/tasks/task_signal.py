@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cchain.tasks.callback_tree import require_single
+from sb3_cchain.tasks.callback_tree import require_every_rollout, require_single
 from sb3_cchain.tasks.drift import Drift
 from sb3_cchain.tasks.signal import (
     TASK_KEY,
@@ -129,6 +129,7 @@ class TaskSignal(BaseCallback):
         return step if step is not None and step < self.model._total_timesteps else None
 
     def _on_training_start(self) -> None:
+        require_every_rollout(self)
         require_single(self)
         if self.attribute is not None and not self.training_env.has_attr(self.attribute):
             raise ValueError(f"`attribute` must be one of the environment or of a wrapper, but none has {self.attribute!r}")
