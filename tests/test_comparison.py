@@ -33,6 +33,14 @@ def test_seeds_without_a_common_step_have_no_band():
 
 def test_smoothed_by_hand():
     assert smoothed(np.array([1.0, 3.0, 8.0, 1.0]), window=2).tolist() == [1.0, 2.0, 5.5, 4.5]
+    assert smoothed(np.array([1.0, 3.0]), window=5).tolist() == [1.0, 2.0]
+    assert smoothed(np.array([]), window=2).tolist() == []
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_value_that_is_not_finite_is_in_the_means_that_have_it_alone(value):
+    means = smoothed(np.array([1e20, 1.0, value, 3.0, 5.0, 6.0]), window=2)
+    np.testing.assert_array_equal(means, [1e20, 5e19, value, value, 4.0, 5.5])
 
 
 def test_band_of_what_has_no_logarithm():

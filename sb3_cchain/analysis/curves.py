@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
@@ -20,10 +21,13 @@ def smoothed(values: Array, window: int) -> Array:
     :param window: Length of the running mean
     :return: Mean of the last ``window`` values at each point, of fewer at the beginning
     """
-    sums = np.cumsum(np.insert(values, 0, 0.0))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - window, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+    n_values = len(values)
+    width = min(window, n_values)
+    if n_values == 0:
+        return np.zeros(0)
+    # Not by differences of cumulated sums, in which a value that is NaN or infinite would spoil all that follow
+    padded = np.concatenate([np.zeros(width - 1), values])
+    return sliding_window_view(padded, width).sum(axis=1) / np.minimum(np.arange(1, n_values + 1), width)
 
 
 def band(curves: Sequence[Series], logarithmic: bool = False) -> tuple[Array, Array, Array, Array]:
