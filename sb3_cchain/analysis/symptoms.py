@@ -242,13 +242,15 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
 
     :param model: A model with a complete rollout, or a replay buffer
     :param batch_size: Size of the batch of the replay buffer
-    :return: By name
+    :return: By name; nothing where values are NaN or infinite, which weights that have grown huge are the cause of
     """
     if isinstance(model, OnPolicyAlgorithm):
         values, targets = (getattr(model.rollout_buffer, name).astype(np.float64) for name in ("values", "returns"))
         bound = 0.0
     else:
         values, targets, bound = _replayed_values(model, batch_size)
+    if not np.isfinite(values).all():
+        return {}
     symptoms = {"value_scale": float(np.sqrt(np.mean(targets**2)))}
     if targets.std() > 1e-6 * np.abs(targets).max():
         symptoms["value_spread"] = float(values.std() / targets.std())
