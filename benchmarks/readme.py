@@ -19,7 +19,7 @@ from benchmarks.number_text import thousands, with_error
 from benchmarks.report.cells import Cell, Cells, make_cells
 from benchmarks.report.collapses import COLLAPSED, collapses, collapses_table
 from benchmarks.report.markdown import markdown_table
-from benchmarks.report.paper import read_tables
+from benchmarks.report.paper import Table, read_tables
 from benchmarks.report.places import LINE_LENGTH, write_tables
 from benchmarks.report.tables import method_label, table_methods
 from benchmarks.report.task_tables import MISSING, returns_header, returns_rows
@@ -54,10 +54,9 @@ def readme_table(cells: Cells) -> str:
     rows = []
     for env_id in SUITES[SUITE].env_ids:
         here = [cells[env_id, method] for method in METHODS]
-        figures = [paper.figures[env_id, method] for method in ("vanilla", "cchain")]
         lengths = f"{here[0].results[0].n_tasks} × {thousands(here[0].results[0].steps_per_task)}"
         n_seeds = ", ".join(map(str, sorted({len(cell.seeds) for cell in here})))
-        printed = [with_error(figure.mean, figure.standard_error, 0) for figure in figures]
+        printed = [_printed(paper, env_id, method) for method in ("vanilla", "cchain")]
         rows.append([short_name(env_id), lengths, n_seeds, *map(_score, here), *printed])
     labels = [method_label(SUITE, method) for method in METHODS]
     header = ["J(T)", "tasks × steps", "seeds", *labels, "PPO, paper", "C-CHAIN, paper"]
@@ -103,9 +102,7 @@ def scores_table(runs: Sequence[Result]) -> str:
     for method in table_methods(cells, paper):
         row = [method_label(SUITE, method)]
         for env_id in env_ids:
-            figure = paper.figures.get((env_id, method))
-            printed = MISSING if figure is None else with_error(figure.mean, figure.standard_error, 0)
-            row += [_score(cells.get((env_id, method))), printed]
+            row += [_score(cells.get((env_id, method))), _printed(paper, env_id, method)]
         rows.append(row)
     return markdown_table(header, rows)
 
@@ -119,6 +116,11 @@ def _score(cell: Cell | None) -> str:
     if cell is None:
         return MISSING
     return with_error(cell.mean, cell.error, 0)
+
+
+def _printed(paper: Table, env_id: str, method: str) -> str:
+    figure = paper.figures.get((env_id, method))
+    return MISSING if figure is None else with_error(figure.mean, figure.standard_error, 0)
 
 
 def plot(cells: Cells, path: Path) -> None:

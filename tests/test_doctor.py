@@ -210,6 +210,17 @@ def test_a_standard_deviation_that_an_update_breaks(value, found, monkeypatch):
     assert [finding.check.name for finding in doctor.findings] == [found] and "inf" in message
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_values_that_are_not_finite_say_nothing_of_the_rewards(value):
+    model = make(PPO).learn(64)
+    assert "value_scale" in value_symptoms(model, 32)
+    model.rollout_buffer.values[0] = value
+    assert value_symptoms(model, 32) == {}
+    model = make(DQN).learn(64)
+    fill(next(model.q_net.parameters()), value)
+    assert value_symptoms(model, 32) == {}
+
+
 def test_likely_findings_come_first():
     symptoms = {"discount": 0.0, "weight_gain/a": 1.0, "weight_gain/b": 100.0}
     first, second = diagnose(symptoms, make(PPO))

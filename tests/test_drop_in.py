@@ -115,7 +115,7 @@ def test_lazy_and_infinite_parameters(algorithm, kwargs):
     assert model.learn(16).num_timesteps == 16
 
 
-class WholePolicy(ActorCriticPolicy):
+class LinearPolicy(BasePolicy):
     """Has what PPO and A2C call, and none of the networks of Stable-Baselines3's policies."""
 
     def _build(self, lr_schedule):
@@ -137,6 +137,10 @@ class WholePolicy(ActorCriticPolicy):
 
     def _predict(self, observation, deterministic=False):
         return self.forward(observation)[0]
+
+
+class WholePolicy(LinearPolicy, ActorCriticPolicy):
+    """Does not say what its distribution is."""
 
     def _categorical(self, obs):
         return th.distributions.Categorical(logits=self.actor(obs))
@@ -196,33 +200,18 @@ def test_policies_of_another_kind_hold_their_values_still(algorithm, kwargs):
     assert model.logger.name_to_value["churn/value_churn"] > 0
 
 
-class OwnPolicy(BasePolicy):
+class OwnPolicy(LinearPolicy):
     """Of SB3's, it has the base class of all policies alone, and a distribution."""
 
     def __init__(self, observation_space, action_space, lr_schedule, use_sde=False, **kwargs):
         super().__init__(observation_space, action_space, **kwargs)
-        (n_observations,) = observation_space.shape
-        self.actor, self.critic = nn.Linear(n_observations, int(action_space.n)), nn.Linear(n_observations, 1)
         self.action_dist = CategoricalDistribution(int(action_space.n))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
+        self._build(lr_schedule)
 
     def get_distribution(self, obs):
         return self.action_dist.proba_distribution(self.actor(obs))
 
-    def forward(self, obs, deterministic=False):
-        distribution = self.get_distribution(obs)
-        actions = distribution.get_actions(deterministic)
-        return actions, self.critic(obs), distribution.log_prob(actions)
-
-    def evaluate_actions(self, obs, actions):
-        distribution = self.get_distribution(obs)
-        return self.critic(obs), distribution.log_prob(actions), distribution.entropy()
-
-    def predict_values(self, obs):
-        return self.critic(obs)
-
-    def _predict(self, observation, deterministic=False):
-        return self.forward(observation, deterministic)[0]
+    _categorical = get_distribution
 
 
 @EACH_ON_POLICY

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import EventCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_cchain.algorithms.churn_state import keep_churn_state
@@ -16,7 +15,7 @@ from sb3_cchain.callbacks.training_hooks import TrainingHooks
 from sb3_cchain.churn import ChurnReducer, ChurnReducers
 from sb3_cchain.networks.algorithm_kinds import is_trpo
 from sb3_cchain.networks.lean_distributions import make_lean
-from sb3_cchain.tasks.callback_tree import require_single
+from sb3_cchain.tasks.callback_tree import refuse_event, require_every_rollout, require_single
 from sb3_cchain.tasks.signal import TaskSwitch, step_task
 from sb3_cchain.tensorboard.overview import add_overview
 from sb3_cchain.validation import check_bool
@@ -100,7 +99,7 @@ class CChainCallback(FiniteCheck):
         if hasattr(model, "churn_reducers"):
             raise TypeError(f"{name} reduces churn by itself; give CChainCallback to a stock model")
         self._check_options(name, self._arguments.target_names(churn_kind(type(model)), name))
-        self._check_parent()
+        refuse_event(self, self.parent)  # a `callback_on_new_best` is initialised, and hears of nothing else
         add_overview(model)
         if self.lean and isinstance(model, OnPolicyAlgorithm):
             make_lean(model)
@@ -124,16 +123,9 @@ class CChainCallback(FiniteCheck):
             if given != only and not is_known:
                 raise ValueError(f"`{argument}` must be {only!r} for {algorithm} that holds still {targets}, got {given!r}")
 
-    def _check_parent(self) -> None:
-        if isinstance(self.parent, EventCallback):
-            raise ValueError(
-                f"CChainCallback must be called at every rollout, but {type(self.parent).__name__} holds it: "
-                "give it to `learn()` beside the other callbacks"
-            )
-
     def _on_training_start(self) -> None:
         self._hooks.begin(self.model)
-        self._check_parent()  # again: SB3 initialises the callbacks in a list before it tells them their parent
+        require_every_rollout(self)
         require_single(self)  # two would add the churn loss twice
 
     def _on_step(self) -> bool:

@@ -242,7 +242,7 @@ def value_symptoms(model: OnPolicyAlgorithm | OffPolicyAlgorithm, batch_size: in
 
     :param model: A model with a complete rollout, or a replay buffer
     :param batch_size: Size of the batch of the replay buffer
-    :return: By name; nothing where values are NaN or infinite, which weights that have grown huge are the cause of
+    :return: By name; nothing where values are NaN or infinite, as those of huge weights are
     """
     if isinstance(model, OnPolicyAlgorithm):
         values, targets = (getattr(model.rollout_buffer, name).astype(np.float64) for name in ("values", "returns"))

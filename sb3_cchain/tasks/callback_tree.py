@@ -54,11 +54,21 @@ def require_every_rollout(callback: BaseCallback) -> None:
     :raises ValueError: When another one holds it that calls it at its events alone, and never between rollouts
     """
     for given in iterate_callbacks(callback.locals.get("callback")):
-        if isinstance(given, EventCallback) and any(held is callback for held in iterate_callbacks(given.callback)):
-            raise ValueError(
-                f"{type(callback).__name__} must be called at every rollout, but {type(given).__name__} holds it: "
-                "give it to `learn()` beside the other callbacks"
-            )
+        if given is not callback and callback in iterate_callbacks(given):
+            refuse_event(callback, given)
+
+
+def refuse_event(callback: BaseCallback, holder: BaseCallback | None) -> None:
+    """
+    :param callback: A callback that acts between rollouts
+    :param holder: One that holds it
+    :raises ValueError: When the holder calls it at its events alone, and never between rollouts
+    """
+    if isinstance(holder, EventCallback):
+        raise ValueError(
+            f"{type(callback).__name__} must be called at every rollout, but {type(holder).__name__} holds it: "
+            "give it to `learn()` beside the other callbacks"
+        )
 
 
 def require_unchanged_network(callback: BaseCallback) -> None:
