@@ -54,8 +54,9 @@ class ChurnCoefficient(nn.Module):
                     "rate that is too high."
                 )
 
-    def problem(self) -> str | None:
+    def problem(self, n_still: int = 0) -> str | None:
         """
+        :param n_still: The last iterations in a row in which the outputs moved by no more than ``LOSS_EPS``
         :return: Why λ cannot do what it is for; None where it can
         """
         return None
@@ -141,9 +142,11 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
                 sums[index] = buffer.sum()
         self.n_seen.add_(1)
 
-    def problem(self) -> str | None:
+    def problem(self, n_still: int = 0) -> str | None:
         """
-        :return: Right after a window has ended, why λ cannot hold the ratio of the losses over it; None where it can, and at
+        :param n_still: The last iterations in a row in which the outputs moved by no more than ``LOSS_EPS``. The churn loss
+            does not tell: a cross-entropy holds the entropy of the old policy, too
+        :return: Right after a window has ended, why churn reduction did nothing in it; None where it did something, and at
             other times
         """
         n_seen, window = int(self.n_seen), len(self.base_losses)
@@ -153,12 +156,12 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         if base_loss <= LOSS_EPS:
             loss = f"the loss that it is compared with is almost 0 (mean absolute value {base_loss:.2g})"
             advice = f"churn is hardly reduced: λ is {self.value:.2g}. Give a fixed `churn_coef`, or a `churn_coef_min`"
-        elif churn_loss <= LOSS_EPS:
-            loss = f"the outputs of the network hardly change (mean churn loss {churn_loss:.2g}, no more than {LOSS_EPS:g})"
-            advice = f"λ stays at {self.value:.2g}, and `target_churn_ratio` is not reached. There may be no churn to reduce"
+        elif churn_loss <= LOSS_EPS or n_still >= window:
+            loss = f"the outputs of the network hardly change (their mean change is no more than {LOSS_EPS:g})"
+            advice = f"there may be no churn to reduce: the churn loss does nothing, with a λ of {self.value:.2g}"
         else:
             return None
-        return f"Over {window} iterations of churn reduction, {loss}, so {advice}."
+        return f"Over {window} iterations of churn reduction, {loss}; {advice}."
 
     def reset(self) -> None:
         """Forget the losses seen and begin a new warm-up."""

@@ -8,7 +8,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_cchain.churn.coefficient import ChurnCoefficient
+from sb3_cchain.churn.coefficient import LOSS_EPS, ChurnCoefficient
 from sb3_cchain.churn.divergence import Divergence, mean_squared_difference
 
 # A tensor, or tensors by names; dicts nest
@@ -67,6 +67,8 @@ class ChurnReducer(nn.Module):
         self.losses: list[float] = []
         # The samples since the last `end_iteration()`: their number, and the sum of their loss minus the loss without churn
         self._n_samples, self._churn_sum = 0, 0.0
+        # The last iterations in a row in which the outputs hardly moved
+        self._n_still = 0
         self._has_warned = False
 
     def backward(
@@ -156,19 +158,21 @@ class ChurnReducer(nn.Module):
         """
         Adapt λ to the losses since the last call. Without an update in between, nothing happens.
 
-        Warns once when, over a whole window, λ could not hold the churn loss at its ratio to the base loss.
+        Warns once when, over a whole window, λ could not hold the churn loss at its ratio to the base loss, or there was no
+        churn.
 
         :param base_loss: The mean over these updates of the loss that the churn loss was added to
         :param each_update: Whether each update counts as an iteration of λ's warm-up and window, instead of all of them as one
         :raises ValueError: When it is NaN or infinite
         """
-        losses = self.losses
+        losses, churn = self.losses, self.mean_churn()
         self.discard_losses()
         if not losses:
             return
         for churn_loss in losses if each_update else [sum(losses) / len(losses)]:
             self.coefficient.update(base_loss, churn_loss)
-            problem = None if self._has_warned else self.coefficient.problem()
+            self._n_still = self._n_still + 1 if abs(churn) <= LOSS_EPS else 0
+            problem = None if self._has_warned else self.coefficient.problem(self._n_still)
             if problem is not None:
                 self._has_warned = True
                 warnings.warn(problem)
