@@ -32,7 +32,7 @@ from benchmarks.report.estimates import (
     sample,
 )
 from benchmarks.report.figures import plot_learning_curves, plot_quantities, plot_reliable_metrics
-from benchmarks.report.first_sight import missing_runs, missing_section
+from benchmarks.report.first_sight import missing_runs, missing_section, not_run
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.page import html_page
 from benchmarks.report.paper import read_tables
@@ -1038,12 +1038,13 @@ def test_table_of_signs_by_hand(tmp_path):
     for seed in (0, 1):
         write(tmp_path, "cchain", [[-100], [-90 - seed]], seed=seed)
     (row,) = table_rows(signs_table(cells_in(tmp_path), read_tables()["gym_control"], "cchain", 1))[2:]
-    assert row[:5] == ["Acrobot-v1", "2 − 1", "+254.8", "none: one seed", "–"] and row[-1] == "the paper's; no interval"
+    assert row[:6] == ["Acrobot-v1", "J(T)", "2 − 1", "+254.8", "none: one seed", "–"]
+    assert row[-1] == "the paper's; no interval"
     # -119.211 + 372.725; squared errors 48.01 and 10.68, of 6 seeds: 7.12 degrees of freedom, a t of 2.357
-    assert row[5] == "+253.5"
-    low, high = map(float, row[6].strip("[]").split(", "))
+    assert row[6] == "+253.5"
+    low, high = map(float, row[7].strip("[]").split(", "))
     assert (high - low) / 2 == pytest.approx(2.357 * 58.69**0.5, abs=0.1)
-    assert float(row[7]) == pytest.approx(253.5 / (6 * 58.69 / 2) ** 0.5 * (1 - 3 / 39), abs=0.1)
+    assert float(row[8]) == pytest.approx(253.5 / (6 * 58.69 / 2) ** 0.5 * (1 - 3 / 39), abs=0.1)
 
 
 def test_what_is_missing_by_hand(tmp_path):
@@ -1058,7 +1059,12 @@ def test_what_is_missing_by_hand(tmp_path):
     assert row[0] == f"`{ACROBOT}`" and dict(zip(header, row, strict=True))["`vanilla`"] == "2560.0 (2 seeds)"
     command = "python -m benchmarks.run --suite gym_control --budget"
     assert f"{command} reduced --env {ACROBOT} --method oracle " in text and f"{command} paper --seeds 0 1 2 " in text
-    assert missing_section("gym_control", runs, paper, "a comparison") == []
+    assert missing_section("gym_control", runs, paper, "a comparison") == not_run("gym_control", paper, "a comparison") == []
+    # 12 seeds of both methods of 3 games, at the rates of the suite's row
+    hours = 12 * 3 * 1_500_000 * (1 / 125 + 1 / 82) / 3600
+    minatar = "\n".join(not_run("minatar", read_tables()["minatar"], "paper"))
+    assert minatar.startswith("**Continual MinAtar**: no run of this budget.")
+    assert f"24 runs, {hours:,.1f} core-hours" in minatar
     # 3 seeds of 2 β in 4 environments, at the 510 steps a second of C-CHAIN in the suite's row
     for lines, rate in (
         ("cchain@1e3 cchain@1e5", 510),
@@ -1098,7 +1104,14 @@ def test_best_of_betas_by_hand(tmp_path):
     assert (list(best.cells), best.strength, best.shipped) == (["1e3", "1e4", "1e5"], "1e5", "1e4")
     row = table_rows(best_table([best], read_tables()["gym_control"]))[2]
     here = ["-90.0 (best of 3: β = 1e5)", "-110.0 (β = 1e4)", "-119.2 ± 6.9 (best of 3)"]
-    assert row == ["Acrobot-v1, C-CHAIN PPO", "β = 1e3, 1e4, 1e5", "0 1", *here, "not enough runs: 2 seeds, other length"]
+    assert row == [
+        "Acrobot-v1, C-CHAIN PPO",
+        "J(T)",
+        "β = 1e3, 1e4, 1e5",
+        "0 1",
+        *here,
+        "not enough runs: 2 seeds, other length",
+    ]
     # Further seeds of the best alone do not count
     for seed in (2, 3):
         write(tmp_path, "cchain", [[0], [0]], seed=seed, variant="cchain@1e5", overrides=("target_churn_ratio:1e5",))
@@ -1107,7 +1120,7 @@ def test_best_of_betas_by_hand(tmp_path):
     write_best([best], tmp_path / "best_of.csv")
     header, line = (tmp_path / "best_of.csv").read_text().splitlines()
     assert header == ",".join(COLUMNS)
-    assert line == f"gym_control,{ACROBOT},cchain,target_churn_ratio,1e3 1e4 1e5,0 1,1e5,-90.0,1e4,-110.0"
+    assert line == f"gym_control,{ACROBOT},cchain,J(T),target_churn_ratio,1e3 1e4 1e5,0 1,1e5,-90.0,1e4,-110.0"
     write_best([], tmp_path / "best_of.csv")
     assert not (tmp_path / "best_of.csv").exists()
 
@@ -1135,18 +1148,20 @@ def test_best_of_kappa_and_c(tmp_path, no_drawing):
         write(tmp_path, run.method, [[value], [value]], variant=run.variant, overrides=run.overrides)
     write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
-    rows = [row for row in table_rows(text.split("### Best of several strengths")[1]) if len(row) == 7]
-    kappa, c = (row for row in rows if "(best of" in row[3])
-    assert kappa[:2] == ["Acrobot-v1, Weight clipping", "κ = 0.5, 1"] and c[:2] == ["Acrobot-v1, L2 Init", "c = 1, 10"]
-    assert (
-        kappa[3:5] == ["-100.0 (best of 2: κ = 0.5)", "-110.0 (κ = 1)"] and kappa[6] == "not enough runs: κ = 0.1, 10 missing"
-    )
-    assert c[3:5] == ["-200.0 (best of 2: c = 10)", "-200.0 (c = 10)"] and c[6] == "not enough runs: c = 0.1, 100, 1e3 missing"
+    rows = [row for row in table_rows(text.split("### Best of several strengths")[1]) if len(row) == 8]
+    kappa, c = (row for row in rows if "(best of" in row[4])
+    assert kappa[:3] == ["Acrobot-v1, Weight clipping", "J(T)", "κ = 0.5, 1"]
+    assert c[:3] == ["Acrobot-v1, L2 Init", "J(T)", "c = 1, 10"]
+    assert kappa[4:6] == ["-100.0 (best of 2: κ = 0.5)", "-110.0 (κ = 1)"]
+    assert c[4:6] == ["-200.0 (best of 2: c = 10)", "-200.0 (c = 10)"]
+    assert [row[7] for row in (kappa, c)] == [
+        f"not enough runs: {lacks} missing" for lacks in ("κ = 0.1, 10", "c = 0.1, 100, 1e3")
+    ]
     assert "| Weight clipping, κ = 0.5 |" in text and "optimizer_kwargs=dict(clip_ratio=0.5, base" in text
     lines = (tmp_path / "out" / "best_of.csv").read_text().splitlines()[1:]
-    assert [line.split(",")[2:7] for line in lines] == [
-        ["weight_clipping", "clip_ratio", "0.5 1", "0", "0.5"],
-        ["l2_init", "coef", "1 10", "0", "10"],
+    assert [line.split(",")[2:8] for line in lines] == [
+        ["weight_clipping", "J(T)", "clip_ratio", "0.5 1", "0", "0.5"],
+        ["l2_init", "J(T)", "coef", "1 10", "0", "10"],
     ]
 
 

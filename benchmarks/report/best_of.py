@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.grid.run import lines_in_order, short_name, strength_of, suite_methods
 from benchmarks.grid.strengths import shortest, split_line
 from benchmarks.number_text import with_error
-from benchmarks.report.cells import Cell, Cells
+from benchmarks.report.cells import Cell, Cells, common_rule
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import Table
 from benchmarks.report.tables import method_label, table_digits
@@ -20,7 +20,7 @@ from benchmarks.report.verdicts import TOO_FEW, verdict_words
 # Where the paper takes the best of several in each environment; in the other suites C-CHAIN has one β
 PAPER_SUITES = ("gym_control", "procgen")
 
-COLUMNS = ("suite", "env_id", "method", "strength", "values", "seeds", "best", "best_mean", "shipped", "shipped_mean")
+COLUMNS = ("suite", "env_id", "method", "score", "strength", "values", "seeds", "best", "best_mean", "shipped", "shipped_mean")
 
 WORDS = """\
 In each environment the best of the strengths of a method that were run (β of C-CHAIN, κ of weight clipping, c of L2 Init), by
@@ -52,6 +52,11 @@ class Best:
     seeds: list[int]
     strength: str
     shipped: str | None
+
+    @property
+    def rule(self) -> str:
+        """The rule that all of them are scored by."""
+        return common_rule(self.cells.values())
 
     @property
     def cell(self) -> Cell:
@@ -126,6 +131,7 @@ def best_table(found: Sequence[Best], paper: Table) -> str:
         rows.append(
             [
                 f"{short_name(best.env_id)}, {method_label(best.suite, best.method)}",
+                best.rule,
                 f"{symbol} = {', '.join(best.cells)}",
                 " ".join(map(str, best.seeds)),
                 f"{best.mean(best.strength):.{digits}f} (best of {len(best.cells)}: {symbol} = {best.strength})",
@@ -134,7 +140,7 @@ def best_table(found: Sequence[Best], paper: Table) -> str:
                 words,
             ]
         )
-    header = ["J(T)", "strengths", "seeds", "best of n", "shipped, fixed", "paper", "best of n against the paper"]
+    header = ["", "score", "strengths", "seeds", "best of n", "shipped, fixed", "paper", "best of n against the paper"]
     return markdown_table(header, rows)
 
 
@@ -157,14 +163,14 @@ def write_best(found: Sequence[Best], path: Path) -> None:
             means = ["" if mean is None else round(mean, 3) for mean in map(best.mean, (best.strength, best.shipped))]
             outcome = best.strength, means[0], best.shipped, means[1]
             values, seeds = " ".join(best.cells), " ".join(map(str, best.seeds))
-            writer.writerow([best.suite, best.env_id, best.method, strength.argument, values, seeds, *outcome])
+            writer.writerow([best.suite, best.env_id, best.method, best.rule, strength.argument, values, seeds, *outcome])
 
 
 def _means(cells: dict[str, Cell], seeds: Sequence[int]) -> dict[str, float]:
-    """Of each strength, by the same rule for all: that of the paper where all have it."""
-    by_paper = all(cell.released_scores is not None for cell in cells.values())
+    """Of each strength, by the same rule for all."""
+    rule = common_rule(cells.values())
     means = {}
     for strength, cell in cells.items():
-        scores = dict(zip(cell.seeds, cell.paper_scores if by_paper else cell.scores, strict=True))
+        scores = dict(zip(cell.seeds, cell.scores_by(rule), strict=True))
         means[strength] = float(np.mean([scores[seed] for seed in seeds]))
     return means

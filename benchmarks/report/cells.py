@@ -13,6 +13,9 @@ from benchmarks.report.estimates import Interval, bootstrap_interval, mean_and_e
 
 Cells = dict[tuple[str, str], "Cell"]
 
+# By which rule runs are scored, in the tables that compare them
+JT, RELEASED = "J(T)", "released code"
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -41,6 +44,13 @@ class Cell:
     def seeds(self) -> list[int]:
         """Seeds of the runs."""
         return [result.seed for result in self.results]
+
+    def scores_by(self, rule: str) -> tuple[float, ...]:
+        """
+        :param rule: ``JT``, or ``RELEASED`` where the runs logged that
+        :return: The score of each run by that rule
+        """
+        return self.paper_scores if rule == RELEASED else self.scores
 
     def with_seeds(self, seeds: Container[int]) -> "Cell":
         """
@@ -75,6 +85,14 @@ class Cell:
             versions = {name: result.versions.get(name, "unknown") for name in differing}
             by_versions.setdefault(versions_text(versions), []).append(result.seed)
         return list(by_versions.items())
+
+
+def common_rule(cells: Iterable[Cell]) -> str:
+    """
+    :param cells: Cells that are compared with each other
+    :return: The rule to score them all by: ``RELEASED`` where all runs have logged that, else ``JT``
+    """
+    return RELEASED if all(cell.released_scores is not None for cell in cells) else JT
 
 
 def make_cells(results: Iterable[Result]) -> tuple[Cells, list[str]]:

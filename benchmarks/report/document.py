@@ -26,7 +26,7 @@ from benchmarks.report.continual_table import continual_table
 from benchmarks.report.estimates import mean_and_error
 from benchmarks.report.figures import plot_learning_curves, plot_quantities
 from benchmarks.report.first_sight import WORDS as FIRST_SIGHT
-from benchmarks.report.first_sight import first_sight
+from benchmarks.report.first_sight import first_sight, not_run
 from benchmarks.report.markdown import code, escaped, markdown_table
 from benchmarks.report.page import html_page
 from benchmarks.report.paper import Table, read_tables
@@ -86,7 +86,9 @@ READING = """\
 RELEASED_WORDS = """\
 {rule}
 
-Both scores, of the cells all of whose runs logged what it takes. The other tables of this page have J(T)."""
+Both scores, of the cells all of whose runs logged what it takes. The verdicts, and what is compared over several cells, go by
+this rule where all of the runs have it: of the differences C-CHAIN − Vanilla and the best of several strengths a column says
+so, of the metrics over the environments the text. The other tables of this page have J(T)."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
@@ -139,6 +141,7 @@ def write_report(results: Sequence[Result], experiment: str, folder: Path, left_
         for suite, (cells, _) in cells_of.items()
         for part in first_sight(suite, cells, by_suite[suite], tables[suite], experiment)
     ]
+    sight += [part for suite, runs in by_suite.items() if not runs for part in not_run(suite, tables[suite], experiment)]
     sections = [
         _suite_section(suite, by_suite[suite], *cells_of[suite], found[suite], tables[suite], pictures) for suite in cells_of
     ]

@@ -106,6 +106,17 @@ def missing_runs(
     ]
 
 
+def not_run(suite: str, paper: Table, budget: str) -> list[str]:
+    """
+    :param suite: Name of a suite without any run
+    :param paper: The paper's table
+    :param budget: Name of the budget
+    :return: What its runs take, and the command that makes them; nothing of budgets other than ``BUDGETS``
+    """
+    section = missing_section(suite, [], paper, budget)
+    return [f"**{SUITES[suite].title}**: no run of this budget.", *section] if section else []
+
+
 def missing_section(suite: str, results: Sequence[Result], paper: Table, budget: str) -> list[str]:
     """
     :param suite: Name of the suite
@@ -130,10 +141,10 @@ def missing_section(suite: str, results: Sequence[Result], paper: Table, budget:
         lines.append(f"{command} --env {missing[0].env_id} --method {missing[0].method}    # one cell")
     parts = [
         f"Missing of the budget's {N_SEEDS.get(budget, paper.n_seeds)} seeds: {len(missing)} runs, "
-        f"{sum(map(sum, by_cell.values())):.1f} core-hours, by the rates of the runs that are there, and where there are none "
-        "by those of `benchmarks/grid/suites.py`."
+        f"{sum(map(sum, by_cell.values())):,.1f} core-hours, by the rates of the runs that are there, and where there are "
+        "none by those of `benchmarks/grid/suites.py`."
     ]
-    if missing:
+    if missing and results:
         parts.append(markdown_table(["core-hours", *map(code, paper.methods)], rows))
     for method in paper.methods:
         if others := other_strengths(suite, method):

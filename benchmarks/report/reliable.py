@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.grid.run import short_name, suite_lines
 from benchmarks.grid.suites import SUITES
-from benchmarks.report.cells import Cells
+from benchmarks.report.cells import RELEASED, Cells, common_rule
 from benchmarks.report.estimates import METRICS, normalized, probability_of_improvement, reliable_metrics
 from benchmarks.report.figures import plot_reliable_metrics
 from benchmarks.report.markdown import markdown_table
@@ -16,7 +16,7 @@ from benchmarks.report.tables import cchain_line, method_label, score_matrices, 
 from benchmarks.report.task_tables import MISSING, seeds_text
 
 NORMALIZATION = """\
-Scores are J(T), normalised in each environment so that 0 is the lowest and 1 the highest of the paper's means of all its
+Scores are {scores}, normalised in each environment so that 0 is the lowest and 1 the highest of the paper's means of all its
 methods, the Oracle among them: a scale that the runs here do not move. (The paper's Vanilla and Oracle would make no
 scale: they are too close together in Leaper, and in the opposite order in Quadruped.) The optimality gap is what is missing
 to 1, on average, scores above counting as 1: less is better. In brackets the 95 % interval, bootstrapped over seeds within
@@ -31,12 +31,12 @@ In this section the intervals of fewer than five seeds, here those of {methods},
 often than 95 % promises."""
 
 IMPROVEMENT = """\
-The probability of improvement is that a run of C-CHAIN has a higher J(T) than one of the other method, mean over the
+The probability of improvement is that a run of C-CHAIN has a higher score than one of the other method, mean over the
 environments; 0.5 says nothing either way. Beside it, in how many environments C-CHAIN's mean is the higher one, of the seeds
 of the table above."""
 
 ORACLE_WORDS = """\
-Normalised by the Oracle, as in the paper's figure: J(T) over the mean of {oracle} in that environment. The rows of the paper
+Normalised by the Oracle, as in the paper's figure: scores over the mean of {oracle} in that environment. The rows of the paper
 are made from the means of its table, so they have neither seeds nor intervals, and no IQM, which is over runs."""
 
 NO_ORACLE = """\
@@ -52,7 +52,8 @@ def reliable_section(suite: str, cells: Cells, paper: Table, pictures: Pictures)
     :param pictures: Pictures of the report
     :return: Paragraphs; none without environments in which both Vanilla and C-CHAIN have runs
     """
-    env_ids, scores, seeds = score_matrices(cells, paper)
+    rule = common_rule(cells.values())
+    env_ids, scores, seeds = score_matrices(cells, paper, rule)
     cchain = cchain_line(cells)
     if not {"vanilla", cchain} <= set(scores):
         return []
@@ -62,7 +63,7 @@ def reliable_section(suite: str, cells: Cells, paper: Table, pictures: Pictures)
     words = (
         f"Over {', '.join(map(short_name, env_ids))}, where Vanilla and {cchain_words(suite, cchain)} both have runs. "
         + (f"Left out, because they do not have runs in all of them: {', '.join(without)}. " if without else "")
-        + NORMALIZATION
+        + NORMALIZATION.format(scores="by the rule of the released code" if rule == RELEASED else rule)
     )
     few = [method_label(suite, method) for method in several if len(seeds[method]) < BOOTSTRAP_SEEDS]
     scaled = {method: normalized(matrix, low, high) for method, matrix in scores.items()}

@@ -8,7 +8,7 @@ from benchmarks.grid.results import Result
 from benchmarks.grid.run import lines_in_order, short_name, suite_lines
 from benchmarks.grid.strengths import split_line
 from benchmarks.number_text import with_error
-from benchmarks.report.cells import Cell, Cells
+from benchmarks.report.cells import JT, Cell, Cells
 from benchmarks.report.estimates import best_two
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import AGGREGATE, Table
@@ -127,14 +127,17 @@ def mark_differences(suite: str, paper: Table) -> list[str]:
     return differences
 
 
-def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.ndarray], dict[str, list[int]]]:
+def score_matrices(
+    cells: Cells, paper: Table, rule: str = JT
+) -> tuple[list[str], dict[str, np.ndarray], dict[str, list[int]]]:
     """
     The part of a table that can be aggregated over environments: the environments in which both Vanilla and C-CHAIN
     (:func:`cchain_line`) have runs, and the methods and seeds that are in all of these.
 
     :param cells: Cells of a suite
     :param paper: The paper's table
-    :return: Environments; J(T) of each method, ``(n_seeds, n_environments)``; and each method's seeds
+    :param rule: What the runs are scored by
+    :return: Environments; the scores of each method, ``(n_seeds, n_environments)``; and each method's seeds
     """
     env_ids = [env_id for env_id in paper.lengths if {(env_id, "vanilla"), (env_id, cchain_line(cells))} <= set(cells)]
     matrices, seeds_of = {}, {}
@@ -145,7 +148,7 @@ def score_matrices(cells: Cells, paper: Table) -> tuple[list[str], dict[str, np.
             continue
         seeds = sorted(set.intersection(*(set(cell.seeds) for cell in complete)))
         if seeds:
-            by_seed = [dict(zip(cell.seeds, cell.scores, strict=True)) for cell in complete]
+            by_seed = [dict(zip(cell.seeds, cell.scores_by(rule), strict=True)) for cell in complete]
             matrices[method] = np.array([[scores[seed] for scores in by_seed] for seed in seeds])
             seeds_of[method] = seeds
     return env_ids, matrices, seeds_of

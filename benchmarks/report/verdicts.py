@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from benchmarks.grid.run import short_name
-from benchmarks.report.cells import Cell, Cells
+from benchmarks.report.cells import Cell, Cells, common_rule
 from benchmarks.report.estimates import Difference, Sample, agrees, bootstrap_interval, difference, sample
 from benchmarks.report.markdown import markdown_table
 from benchmarks.report.paper import Figure, Table
@@ -82,18 +82,17 @@ def signs_table(cells: Cells, paper: Table, cchain: str, digits: int) -> str:
         vanilla, churn = cells.get((env_id, "vanilla")), cells.get((env_id, cchain))
         if vanilla is None or churn is None:
             continue
-        by_paper = vanilla.released_scores is not None and churn.released_scores is not None
-        scores = [cell.paper_scores if by_paper else cell.scores for cell in (churn, vanilla)]
-        here = difference(*map(sample, scores))
+        rule = common_rule((churn, vanilla))
+        here = difference(*(sample(cell.scores_by(rule)) for cell in (churn, vanilla)))
         figures = [paper.figures[env_id, method] for method in ("cchain", "vanilla")]
         printed = difference(*(Sample(figure.mean, figure.standard_error, paper.n_seeds) for figure in figures))
         seeds = f"{len(churn.seeds)} − {len(vanilla.seeds)}"
-        row = [short_name(env_id), seeds, *difference_cells(here, digits), *difference_cells(printed, digits)]
+        row = [short_name(env_id), rule, seeds, *difference_cells(here, digits), *difference_cells(printed, digits)]
         if 1 in (len(churn.seeds), len(vanilla.seeds)):
-            row[3] = "none: one seed"
+            row[4] = "none: one seed"
         rows.append([*row, sign_words(here, printed)])
     columns = ["95 % interval", "effect size"]
-    header = ["C-CHAIN − Vanilla", "seeds", "here", *columns, "paper", *columns, "sign"]
+    header = ["C-CHAIN − Vanilla", "score", "seeds", "here", *columns, "paper", *columns, "sign"]
     return markdown_table(header, rows)
 
 
