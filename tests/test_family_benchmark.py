@@ -126,21 +126,27 @@ def test_tables_without_runs(runs):
 
 
 def test_falls():
-    evaluations = np.array([[1, 0.0], [2, 10.0], [3, 4.0], [4, 6.0], [5, 10.0]])
+    evaluations = np.array([[1, 0.0], [2, 10.0], [3, 4.0], [4, 6.0], [5, 10.0], [6, 12.0]])
     assert falls(evaluations, solved=10, worst=0) == (2.0, 4.0, 0.25)
     assert falls(evaluations, solved=10, worst=4) == (2.0, 4.0, 0.5)
-    assert falls(evaluations, solved=11, worst=0) is None
+    # The evaluation that solved it is no fall, and nothing comes after the last one
+    step, *after = falls(evaluations[:2], solved=9, worst=0)
+    assert step == 2.0 and np.isnan(after).all()
+    assert falls(evaluations[4:], solved=10, worst=0) == (5.0, 12.0, 0.0)
+    assert falls(evaluations, solved=13, worst=0) is None
 
 
 def test_a_table_of_falls(runs):
     write(runs[0], [0, 475, 500, 100, 100, 500, 500, 500])
     write(runs[1], [0] * 8)
+    write(runs[3], [0] * 7 + [480])
     table = falls_table(replace(SMALL, solved=475), read_all(runs))
     assert rows(table)[2:] == [
-        ["PPO", "0", "10", "100", "29%", "500", "334"],
+        ["PPO", "0", "10", "100", "33%", "500", "334"],
         ["C-CHAIN", "0", "never", "", "", "0.00", "0.00"],
+        ["C-CHAIN", "1", "40", "", "", "480", "60.0"],
     ]
-    assert table.endswith("Seeds that are not done yet: PPO: 1; C-CHAIN: 1.")
+    assert table.endswith("Seeds that are not done yet: PPO: 1.")
 
 
 @pytest.mark.parametrize("value, text", [(-181.3, "-181"), (1234.5, "1234"), (23.45, "23.4"), (0.984, "0.98"), (99.96, "100")])

@@ -77,6 +77,36 @@ def test_the_range_of_beta_depends_on_the_actions(algo, n_actions, low, high):
     assert np.ptp(np.log10(ratios)) > 1
 
 
+@pytest.mark.parametrize(
+    "algo, churn_target, ranges",
+    [
+        ("ppo_cchain", "value", {"": (1e-3, 1e-1)}),
+        ("sac_cchain", "value", {"": (1e-4, 1e-2)}),
+        ("sac_cchain", "both", {"policy": (5e-6, 5e-4), "value": (1e-4, 1e-2)}),
+    ],
+)
+def test_the_beta_of_what_is_held_still_is_searched(algo, churn_target, ranges):
+    search.register_search_spaces()
+    search.search_churn_target(algo, churn_target)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for trial in (study.ask() for _ in range(10)):
+        ratios = search.HYPERPARAMS_SAMPLER[algo](trial, 0, 1, {"using_her_replay_buffer": False})["target_churn_ratio"]
+        assert search.HYPERPARAMS_CONVERTER[algo](trial.params)["target_churn_ratio"] == ratios
+        by_name = ratios if churn_target == "both" else {"": ratios}
+        assert all(low <= by_name.pop(name) <= high for name, (low, high) in ranges.items()) and not by_name
+    with pytest.raises(ValueError, match='`churn_target` of CChainDQN must be "value"'):
+        search.search_churn_target("dqn_cchain", "policy")
+    search.register_search_spaces()
+
+
+def test_a_search_follows_the_settings(tmp_path):
+    options = ("--algo", "a2c_cchain", "--env", "CartPole-v1", "-n", "64", "-f", tmp_path, *FAST, *OPTIMIZE, "--n-trials", "2")
+    command("train", *options, "-params", "churn_target:'both'")
+    for trial in read_report(tmp_path / "a2c_cchain"):
+        assert 0.1 <= float(trial["params_target_churn_ratio_policy"]) <= 1e3
+        assert 1e-4 <= float(trial["params_target_churn_ratio_value"]) <= 1e-2
+
+
 @pytest.mark.parametrize("algo, sizes", [("ppo_cchain", {0.25, 0.5, 1.0, 2.0, 4.0, 8.0}), ("dqn_cchain", {None})])
 def test_reference_batches_are_searched(algo, sizes):
     search.register_search_spaces()

@@ -1,5 +1,6 @@
 """The tables of the results."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 from textwrap import fill
@@ -165,14 +166,17 @@ def falls(evaluations: np.ndarray, solved: float, worst: float) -> tuple[float, 
     :param evaluations: Evaluations of a run, ``(n_evaluations, 2)``
     :param solved: Mean return that counts as solved
     :param worst: Return of an agent that can do nothing
-    :return: Step of the first evaluation that solved it, the lowest mean return from then on, and the share of the
-        evaluations from then on below half of the way from ``worst`` to ``solved``; None if it was never solved
+    :return: Step of the first evaluation that solved it, the lowest mean return after it, and the share of the evaluations
+        after it below half of the way from ``worst`` to ``solved``, both NaN where none came after; None if it was never
+        solved
     """
     first = np.flatnonzero(evaluations[:, 1] >= solved)
     if len(first) == 0:
         return None
-    from_then_on = evaluations[first[0] :, 1]
-    return float(evaluations[first[0], 0]), float(from_then_on.min()), float((from_then_on < (solved + worst) / 2).mean())
+    step, after = float(evaluations[first[0], 0]), evaluations[first[0] + 1 :, 1]
+    if len(after) == 0:
+        return step, math.nan, math.nan
+    return step, float(after.min()), float((after < (solved + worst) / 2).mean())
 
 
 def falls_table(case: Case, evaluations: Evaluations) -> str:
@@ -188,9 +192,12 @@ def falls_table(case: Case, evaluations: Evaluations) -> str:
     for name, variant in case.variants.items():
         for seed, each in sorted(evaluations[name].items()):
             fall = falls(each, case.solved, case.worst)
-            words = ["never", "", ""] if fall is None else [f"{fall[0]:.0f}", number(fall[1]), f"{fall[2]:.0%}"]
+            words = ["never", "", ""]
+            if fall is not None:
+                step, lowest, share = fall
+                words = [f"{step:.0f}", *(["", ""] if math.isnan(lowest) else [number(lowest), f"{share:.0%}"])]
             rows.append([variant.label, str(seed), *words, number(each[-1, 1]), number(over_training(case, each))])
-    header = ["", "seed", "solved at step", "lowest from then on", "below half from then on", "last", "mean"]
+    header = ["", "seed", "solved at step", "lowest after it", "below half after it", "last", "mean"]
     return _with_missing(markdown_table(header, rows), case, evaluations)
 
 

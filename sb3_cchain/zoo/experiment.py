@@ -44,7 +44,7 @@ from sb3_cchain.envs import TaskVecNormalize
 from sb3_cchain.methods.registry import BY_ALGO
 from sb3_cchain.replaced import replaced
 from sb3_cchain.zoo.checkpoint_options import CHECKPOINTS, RESUMED_FROM, CheckpointOptions, write_resumed_from
-from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, suggest_from_grid
+from sb3_cchain.zoo.search import add_to_callback, add_to_policy_kwargs, search_churn_target, suggest_from_grid
 from sb3_cchain.zoo.settings import missing_parts, read_saved, settings_path, what_cannot_be_read
 from sb3_cchain.zoo.statistics import BEST_STATISTICS, statistics_path
 from sb3_cchain.zoo.summary import TrainingSummary
@@ -336,6 +336,11 @@ class ExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         self._summary.print()
         if self._was_interrupted and self.checkpoints is not None:
             sys.exit(128 + signal.SIGINT)
+
+    def hyperparameters_optimization(self) -> None:
+        """Search the hyperparameters, and the β of what is held still."""
+        search_churn_target(self.algo, self._hyperparams.get("churn_target", "auto"))
+        super().hyperparameters_optimization()
 
     def objective(self, trial: optuna.Trial) -> float:
         """

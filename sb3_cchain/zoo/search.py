@@ -1,6 +1,7 @@
 """What ``sb3-cchain train -optimize`` searches for the algorithms of this package and for the related methods."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import optuna
@@ -13,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cchain.algorithms import DoubleDQN
 from sb3_cchain.algorithms.churn_algorithm import ChurnAlgorithm
-from sb3_cchain.algorithms.churn_targets import ChurnTarget, churn_kind
+from sb3_cchain.algorithms.churn_targets import ChurnArguments, ChurnTarget, churn_kind
 from sb3_cchain.algorithms.reference_batches import REFERENCES
 from sb3_cchain.churn import cross_entropy, mean_squared_difference
 from sb3_cchain.methods.registry import REGISTRY, Method
@@ -23,6 +24,8 @@ from sb3_cchain.methods.registry import REGISTRY, Method
 Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
 # From the values of a trial to the hyperparameters that they stand for
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
+
+BETA = "target_churn_ratio"
 
 # RL Zoo's, by name on the command line
 HYPERPARAMS_SAMPLER: dict[str, Any] = hyperparams_opt.HYPERPARAMS_SAMPLER
@@ -71,20 +74,26 @@ def convert_double_dqn_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
-def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sampler:
+def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm], churn_target: str = "auto") -> Sampler:
     """
     :param sampler: Search space of the algorithm without churn reduction
     :param algorithm: An algorithm with churn reduction
+    :param churn_target: What it holds still; of ``"both"`` each has a β of its own
     :return: The same search space and β, a decade beyond the papers' values on either side. With PPO and DQN also where the
         reference batches are taken from, and with PPO their size.
+    :raises ValueError: When the algorithm has no such target
     """
     kind = churn_kind(algorithm)
-    target = kind.targets[kind.default]
+    names = ChurnArguments(churn_target).target_names(kind, algorithm.__name__)
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
         sampled = sampler(trial, n_actions, n_envs, additional_args)
-        low, high = _BETAS[target.target_ratios[cross_entropy if _is_discrete(target, n_actions) else mean_squared_difference]]
-        sampled["target_churn_ratio"] = trial.suggest_float("target_churn_ratio", low, high, log=True)
+        for name in names:
+            target = kind.targets[name]
+            default = target.target_ratios[cross_entropy if _is_discrete(target, n_actions) else mean_squared_difference]
+            suggested = BETA if len(names) == 1 else f"{BETA}_{name}"
+            sampled[suggested] = trial.suggest_float(suggested, *_BETAS[default], log=True)
+        sampled = with_beta_of_each(sampled)
         if issubclass(algorithm, (PPO, DQN)):
             sampled["churn_reference"] = trial.suggest_categorical("churn_reference", list(REFERENCES))
         if issubclass(algorithm, PPO):
@@ -92,6 +101,16 @@ def with_churn_arguments(sampler: Sampler, algorithm: type[BaseAlgorithm]) -> Sa
         return sampled
 
     return sample
+
+
+def with_beta_of_each(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: Values of a trial
+    :return: The same, with the β of several targets in one dict
+    """
+    each = {name: sampled_params[f"{BETA}_{name}"] for name in ("policy", "value") if f"{BETA}_{name}" in sampled_params}
+    params = {key: value for key, value in sampled_params.items() if not key.startswith(f"{BETA}_")}
+    return {**params, BETA: each} if each else params
 
 
 # By the default: a decade beyond the values of the papers and their code on either side; two where no paper has values
@@ -129,6 +148,19 @@ _SEARCH_SPACES: dict[type[BaseAlgorithm], tuple[Sampler, Converter]] = {
 _RL_ZOO_NAMES = frozenset(HYPERPARAMS_SAMPLER)
 
 
+def search_churn_target(algo: str, churn_target: str) -> None:
+    """
+    Search the β of what is held still.
+
+    :param algo: Name of an algorithm on the command line
+    :param churn_target: Its ``churn_target``
+    :raises ValueError: When the algorithm has no such target
+    """
+    algorithm = ALGOS[algo]
+    if issubclass(algorithm, ChurnAlgorithm) and (space := _search_space(algorithm)):
+        HYPERPARAMS_SAMPLER[algo] = with_churn_arguments(space[0], algorithm, churn_target)
+
+
 def register_search_spaces() -> None:
     """Make the search spaces of all methods known to RL Zoo, in place."""
     for method in REGISTRY:
@@ -136,13 +168,22 @@ def register_search_spaces() -> None:
             HYPERPARAMS_SAMPLER[method.algo] = lambda *_: {}  # zoo/experiment.py searches the grid
             HYPERPARAMS_CONVERTER[method.algo] = refuse_trial
         elif not method.is_related and method.algo not in _RL_ZOO_NAMES:
-            # That of the nearest base that has one
-            space = next((_SEARCH_SPACES[base] for base in method.algorithm.__mro__ if base in _SEARCH_SPACES), None)
+            space = _search_space(method.algorithm)
             if space is None:
                 continue
-            sampler, HYPERPARAMS_CONVERTER[method.algo] = space
-            has_churn = issubclass(method.algorithm, ChurnAlgorithm)
-            HYPERPARAMS_SAMPLER[method.algo] = with_churn_arguments(sampler, method.algorithm) if has_churn else sampler
+            HYPERPARAMS_SAMPLER[method.algo], HYPERPARAMS_CONVERTER[method.algo] = space
+            if issubclass(method.algorithm, ChurnAlgorithm):
+                search_churn_target(method.algo, "auto")
+                HYPERPARAMS_CONVERTER[method.algo] = partial(_convert_with_beta, space[1])
+
+
+def _search_space(algorithm: type[BaseAlgorithm]) -> tuple[Sampler, Converter] | None:
+    """That of the nearest base that has one."""
+    return next((_SEARCH_SPACES[base] for base in algorithm.__mro__ if base in _SEARCH_SPACES), None)
+
+
+def _convert_with_beta(converter: Converter, sampled_params: dict[str, Any]) -> dict[str, Any]:
+    return with_beta_of_each(converter(sampled_params))
 
 
 def suggest_from_grid(trial: optuna.Trial, method: Method) -> dict[str, Any]:
