@@ -126,14 +126,15 @@ def make_backend(address: str | None, cpus: int | None, gpus_per_run: float) -> 
     return RayBackend(address, gpus_per_run)
 
 
-def list_grid(grid: Sequence[Run], results: Path, logs: Path, console: Console) -> None:
+def list_grid(grid: Sequence[Run], results: Path, logs: Path, console: Console, rates_of: type[Rates] = Rates) -> None:
     """
     :param grid: Runs of the grid
     :param results: Folder of all results
     :param logs: Folder of the logs, with the checkpoints that runs go on from
     :param console: Where they are listed
+    :param rates_of: Makes from the results how long the others take
     """
-    rates = Rates(read_results(results)[0])
+    rates = rates_of(read_results(results)[0])
     n_done, seconds_left = 0, 0.0
     width = max(len(run.name) for run in grid)
     for run in grid:

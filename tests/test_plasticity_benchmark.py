@@ -17,6 +17,7 @@ from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.__main__ import main
 from benchmarks.plasticity.heat_maps import cosines, plot_heat_maps
 from benchmarks.plasticity.page import read_groups, table
+from benchmarks.plasticity.rates import WatchedRates
 from benchmarks.plasticity.runs import COMPONENTS, default_names, lines, quantities, snapshot_times, watched_run
 from benchmarks.plasticity.snapshots import FILE, NTKSnapshots, read_snapshots, write_snapshots
 from sb3_cchain.checkpoint import TrainingCheckpoint, find_checkpoint, resume
@@ -101,6 +102,19 @@ def test_watched_runs_tell_nothing_about_the_time_of_others(tmp_path):
     rates = Rates([make_result(tmp_path, watched, seconds=160.0)])
     assert rates.seconds(watched_run("gym_control", "vanilla", ACROBOT, 0, 2, 1600)) == pytest.approx(320)
     assert rates.seconds(make_result(tmp_path, watched, experiment="paper")) == pytest.approx(1600 / 500)
+
+
+def test_looks_take_no_longer_in_a_long_run(tmp_path):
+    """Acrobot trains 500 steps a second by the suite's row, and 800 steps are a rollout."""
+    # 2 rollouts of 1.6 s each, and a look at each of them, which takes 4 s
+    rates = WatchedRates([make_result(tmp_path, watched_run("gym_control", "vanilla", ACROBOT, 0, 2, 800), seconds=11.2)])
+    # 1000 rollouts, of which every fifth is looked at; a component takes as long as the whole, at 510 steps a second
+    for name, rate in (("vanilla", 500), ("cchain", 510), ("projection", 510)):
+        run = watched_run("gym_control", name, ACROBOT, 0, 5, 160_000)
+        assert rates.seconds(run) == pytest.approx(800_000 / rate + 200 * 4)
+    # Nothing is known of the looks of another suite
+    run = watched_run("procgen", "vanilla", "Continual/Starpilot-v0", 0, 2, 8000)
+    assert rates.seconds(run) == pytest.approx(16_000 / 55)
 
 
 def test_dqn_has_no_components():

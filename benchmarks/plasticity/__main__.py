@@ -21,6 +21,7 @@ from benchmarks.grid.results import find_result
 from benchmarks.grid.run import Run
 from benchmarks.grid.suites import SUITES
 from benchmarks.plasticity.page import read_groups, section, table
+from benchmarks.plasticity.rates import WatchedRates
 from benchmarks.plasticity.runs import COMPONENTS, default_names, watched_run
 from benchmarks.plasticity.snapshots import keep_snapshots
 from benchmarks.report.places import write_tables
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, ImportError) as error:
         parser.error(str(error))
     if args.dry_run:
-        list_grid(runs, args.results, args.logs, Console())
+        list_grid(runs, args.results, args.logs, Console(), WatchedRates)
         return
     try:
         results = train_all(runs, args.results, args.jobs, args.logs, args.gpus_per_run)

@@ -89,13 +89,25 @@ def monitors(run: Run, shipped: Mapping[str, Any]) -> list[str | dict[str, Any]]
     :param shipped: Its hyperparameters
     :return: The monitors, as in a YAML file
     """
-    n_trainings = run.total_steps // shipped.get("n_steps", 1)  # of DQN here, one in a step
-    interval = max(n_trainings // N_LOOKS, 1)
+    interval = max(_n_trainings(run, shipped) // N_LOOKS, 1)
     return [
         "sb3_cchain.ChurnMonitor",
         {"benchmarks.plasticity.snapshots.NTKSnapshots": {"times": snapshot_times(run), "interval": interval}},
         {"sb3_cchain.analysis.NetworkHealth": {"interval": interval}},
     ]
+
+
+def n_looks(run: Run) -> int:
+    """
+    :param run: A run
+    :return: How often it is looked at
+    """
+    n_trainings = _n_trainings(run, shipped_hyperparameters(run.algo, run.env_id) or {})
+    return n_trainings // max(n_trainings // N_LOOKS, 1)
+
+
+def _n_trainings(run: Run, shipped: Mapping[str, Any]) -> int:
+    return run.total_steps // shipped.get("n_steps", 1)  # of DQN here, one in a step
 
 
 def snapshot_times(run: Run) -> list[int]:
