@@ -7,7 +7,7 @@ SUITE = gym_control
 # What the demo needs: its own extra and, elsewhere than in Gym Control, that of the suite. `dev` holds all of them
 DEMO_EXTRAS = $(if $(wildcard $(VENV)/.installed-dev),dev,$(if $(filter gym_control,$(SUITE)),demo,demo,$(SUITE)))
 
-.PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc linkcheck dist clean
+.PHONY: demo test install pytest pytest-fast lint format check-codestyle type commit-checks doc linkcheck dist tables clean
 
 # --- The two commands of the README -------------------------------------------------------------------------------------
 
@@ -67,6 +67,16 @@ dist: $(VENV)/.installed-release
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation --outdir dist .
 	$(BIN)/twine check --strict dist/*
+
+# Anew from the committed results: the reports, and the tables and pictures of the pages
+tables: install
+	$(BIN)/python -m benchmarks.report --budget reduced paper
+	$(BIN)/python -m benchmarks.readme --write
+	$(BIN)/python -m benchmarks.family --write
+	$(BIN)/python -m benchmarks.plasticity --write
+	$(BIN)/python -m benchmarks.sensitivity --write
+	$(BIN)/python -m benchmarks.supervised --write
+	$(BIN)/python -m benchmarks.shelf --write
 
 clean:
 	rm -rf $(VENV) build dist docs/_build .mypy_cache .pytest_cache .ruff_cache

@@ -37,7 +37,7 @@ _CONTINUAL_CARTPOLE: dict[str, Any] = {
     **{"steps": 60_000, "eval_freq": 1500, "seeds": 3, "n_tasks": 4},
     "env_kwargs": {"n_tasks": 4, "steps_per_task": 15_000},
 }
-# SB3's SAC and TD3 are CHAIN's otherwise; its buffer of 1e6 holds everything, as this one does
+# Of the base algorithms; docs/results/family.md says what differs. CHAIN's buffer of 1e6 holds everything, as this one does
 _CHAIN: dict[str, Any] = {"learning_starts": 5000, "buffer_size": 150_000}
 _CHAIN_TD3: dict[str, Any] = {**_CHAIN, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [256, 256]}}
 

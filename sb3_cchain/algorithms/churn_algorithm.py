@@ -42,7 +42,7 @@ class ChurnAlgorithm(FullSignature, ZeroRateWarning):
     :param target_churn_ratio: β, the size of λ·L_churn relative to the base loss. ``"auto"`` is a default for the kind of
         the network's outputs. One for all, or a dict, ``{"policy": ..., "value": ...}``.
     :param churn_warmup: Iterations until λ adapts: calls of ``train()`` on-policy, gradient updates off-policy. None is 10 for
-        PPO, MaskablePPO and RecurrentPPO; for all others 0, where λ adapts after the first churn loss.
+        PPO, MaskablePPO and RecurrentPPO; for all others 0, where λ adapts after the first ``train()`` with a churn loss.
     :param churn_window: Iterations that the running means of both losses cover. None is 50 for PPO, MaskablePPO, RecurrentPPO
         and TRPO, and 1000 for all others, A2C included, in which an iteration is one gradient update.
     :param churn_coef_min: Least value of λ once it adapts
