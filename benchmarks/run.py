@@ -55,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="+",
         help=f"Some of {', '.join(METHOD_NAMES)}, in the order in which they are to run; by default all that the paper "
         "compares in the suite. cchain@1e3 is C-CHAIN with β 1e3 in place of the shipped one, weight_clipping@0.5 weight "
-        "clipping with κ 0.5, l2_init@10 L2 Init with c 10",
+        "clipping with κ 0.5, l2_init@10 L2 Init with c 10. cchain@all is C-CHAIN with each β of which the paper takes the "
+        "best; weight_clipping@all and l2_init@all likewise",
     )
     parser.add_argument(
         "--seeds",

@@ -234,6 +234,9 @@ def test_another_strength_is_a_line_of_its_own(tmp_path):
     assert [run.line for run in grid_runs(["gym_control"], cartpole, ["cchain@1e4", "vanilla", "cchain"], [0])] == [
         *("cchain", "vanilla")
     ]
+    grid = grid_runs(["gym_control"], cartpole, ["cchain@all", "l2_init@all", "cchain"], [0])
+    l2_init = ["l2_init@0.1", "l2_init@1", "l2_init", "l2_init@100", "l2_init@1e3"]
+    assert [run.line for run in grid] == ["cchain@1e3", "cchain", "cchain@1e5", *l2_init]
     evaluated = make_run("minatar", "Continual/MinAtar-v0", "cchain@0.1", 0, 3, 3000, "smoke")
     assert (evaluated.eval_freq, evaluated.line, evaluated.algo) == (100, "cchain@0.1", "dqn_cchain")
 
@@ -397,6 +400,8 @@ def test_runs_that_cannot_be_are_refused(changes, message):
             "--env must be one of Continual/CartPole-v1, .* in gym_control; got Continual/Maze-v0",
         ),
         (["--method", "reset"], "--method must be one of oracle, vanilla, trac, .*, cchain in gym_control; got reset"),
+        (["--method", "vanilla@all"], "`method` can have a strength after @ for .* only; got vanilla@all"),
+        (["--suite", "dmc", "--method", "cchain@all"], "@all in gym_control and procgen only; got cchain@all in dmc"),
         (["--method", "cchain@x"], "`method` must have β after @, a number greater than 0, as in cchain@10; got cchain@x"),
         (["--method", "cchain@-1"], "a number greater than 0, .*; got cchain@-1"),
         (["--method", "l2_init@0"], "`method` must have c after @, a number greater than 0, as in l2_init@10; got l2_init@0"),

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from benchmarks.grid.results import Result
 from benchmarks.grid.run import Run, available_methods, make_run, paper_methods, suite_methods
-from benchmarks.grid.strengths import split_line
+from benchmarks.grid.strengths import paper_lines, split_line
 from benchmarks.grid.suites import SUITES, paper_length
 from sb3_cchain.methods.registry import METHOD_NAMES
 from sb3_cchain.validation import check_number
@@ -58,7 +58,8 @@ def grid_runs(
     :param env_ids: Environments, by default all of the suites
     :param methods: Methods, in the order in which they are to run, by default all that the paper compares in the suite. A
         method runs in those of the environments for which it has hyperparameters. ``cchain@1e3`` is C-CHAIN with β 1e3,
-        ``weight_clipping@0.5`` weight clipping with κ 0.5, ``l2_init@10`` L2 Init with c 10
+        ``weight_clipping@0.5`` weight clipping with κ 0.5, ``l2_init@10`` L2 Init with c 10; ``@all`` stands for all of which
+        the paper takes the best
     :param seeds: Seeds, by default as many as the budget has, from 0 on
     :param budget: One of ``BUDGETS``
     :return: The runs, in the order in which they are to run
@@ -68,7 +69,7 @@ def grid_runs(
     all_envs = [(suite, env_id) for suite in suites for env_id in SUITES[suite].env_ids]
     available = {name for suite, env_id in all_envs for name in available_methods(suite, env_id)}
     _check_names("env", env_ids, [env_id for _, env_id in all_envs], suites)
-    lines = _same_once(methods)
+    lines = _same_once([line for method in methods or () for line in paper_lines(method, suites)])
     _check_names("method", [method for method, _ in lines], [name for name in METHOD_NAMES if name in available], suites)
     for seed in seeds or ():
         check_number("seeds", seed, 0, integer=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.grid.run import lines_in_order, short_name, strength_of, suite_methods
-from benchmarks.grid.strengths import shortest, split_line
+from benchmarks.grid.strengths import PAPER_SUITES, shortest, split_line
 from benchmarks.number_text import with_error
 from benchmarks.report.cells import Cell, Cells, common_rule
 from benchmarks.report.markdown import markdown_table
@@ -16,9 +16,6 @@ from benchmarks.report.paper import Table
 from benchmarks.report.tables import method_label, table_digits
 from benchmarks.report.task_tables import MISSING
 from benchmarks.report.verdicts import TOO_FEW, verdict_words
-
-# Where the paper takes the best of several in each environment; in the other suites C-CHAIN has one β
-PAPER_SUITES = ("gym_control", "procgen")
 
 COLUMNS = ("suite", "env_id", "method", "score", "strength", "values", "seeds", "best", "best_mean", "shipped", "shipped_mean")
 
