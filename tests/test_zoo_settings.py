@@ -11,6 +11,7 @@ import yaml
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import CallbackList, EveryNTimesteps
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from benchmarks.grid.run import suite_methods
@@ -184,6 +185,22 @@ def test_defaults_hold_for_atari_games(algo, arguments, tmp_path, monkeypatch):
     monkeypatch.setitem(gym.registry, "Game-v0", EnvSpec("Game-v0", f"{__name__}:AtariEnv"))
     train(tmp_path, algo, "Game-v0", 32, *arguments)
     assert (tmp_path / algo / "Game-v0_1" / "Game-v0.zip").exists()
+
+
+# Those of PPO, MaskablePPO and DQN are trained elsewhere
+@pytest.mark.parametrize("name", ["a2c", "trpo", "ppo_lstm", "qrdqn", "sac", "td3", "ddpg", "tqc", "crossq"])
+def test_the_defaults_of_the_family_train(name, tmp_path):
+    algo, env_id = f"{name}_cchain", "Pendulum-v1"
+    algorithm = BY_ALGO[algo].algorithm
+    if issubclass(algorithm, OnPolicyAlgorithm):
+        short = ["n_steps:16", *([] if name == "a2c" else ["batch_size:8"])]
+    else:
+        short = ["learning_starts:8", "buffer_size:100", "batch_size:4"]
+        env_id = "CartPole-v1" if name == "qrdqn" else env_id
+    train(tmp_path, algo, env_id, 48, "-params", *short)
+    (path,) = tmp_path.rglob(f"{env_id}.zip")
+    model = algorithm.load(path, device="cpu")
+    assert model._n_updates > 0 and all(reducer.reference is not None for reducer in model.churn_reducers.values())
 
 
 def test_rl_zoos_own_settings_hold_where_we_have_none():
