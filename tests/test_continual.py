@@ -98,7 +98,14 @@ def test_matrix_of_returns():
     assert np.array_equal(before, BEFORE) and np.array_equal(after, AFTER)
     before, after = continual.return_matrix(rows_of(BEFORE, AFTER)[:9])
     assert np.array_equal(after[0], AFTER[0]) and np.isnan(after[1:]).all()
-    assert [part.size for part in continual.return_matrix([])] == [0, 0]
+    before, after = continual.return_matrix([])
+    assert before.size == after.size == continual.forgetting(after).size == 0
+    metrics = (
+        continual.final_performance(after),
+        continual.backward_transfer(after),
+        continual.zero_shot_transfer(before, after),
+    )
+    assert np.isnan(metrics).all()
 
 
 def test_final_performance():

@@ -141,9 +141,10 @@ def final_performance(after: ArrayLike) -> float:
     :math:`P(T) = \frac{1}{N} \sum_i p_i(T)` (Continual World): the mean return on all tasks at the end.
 
     :param after: R, ``(n_tasks, n_tasks)``
-    :return: The mean of its last row
+    :return: The mean of its last row; NaN without tasks
     """
-    return float(np.mean(np.asarray(after, dtype=float)[-1]))
+    matrix = np.asarray(after, dtype=float)
+    return float(np.mean(matrix[-1])) if len(matrix) else float("nan")
 
 
 def forgetting(after: ArrayLike) -> Array:
@@ -155,7 +156,7 @@ def forgetting(after: ArrayLike) -> Array:
     :return: Forgetting of each task, ``(n_tasks,)``; that of the last is 0
     """
     matrix = np.asarray(after, dtype=float)
-    return np.diag(matrix) - matrix[-1]
+    return np.diag(matrix) - matrix[-1] if len(matrix) else np.zeros(0)
 
 
 def backward_transfer(after: ArrayLike) -> float:
@@ -164,7 +165,7 @@ def backward_transfer(after: ArrayLike) -> float:
     the mean of :func:`forgetting` over all tasks but the last, with the opposite sign.
 
     :param after: R, ``(n_tasks, n_tasks)``
-    :return: The mean; NaN for a single task
+    :return: The mean; NaN for a single task, or none
     """
     earlier = -forgetting(after)[:-1]
     return float(np.mean(earlier)) if len(earlier) else float("nan")
