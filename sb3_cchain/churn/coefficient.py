@@ -153,12 +153,13 @@ class AdaptiveChurnCoefficient(ChurnCoefficient):
         if n_seen % window or n_seen < self.warmup or not n_seen:
             return None
         base_loss, churn_loss = (self.sums / window).tolist()
-        if base_loss <= LOSS_EPS:
-            loss = f"the loss that it is compared with is almost 0 (mean absolute value {base_loss:.2g})"
-            advice = f"churn is hardly reduced: λ is {self.value:.2g}. Give a fixed `churn_coef`, or a `churn_coef_min`"
-        elif churn_loss <= LOSS_EPS or n_still >= window:
+        # First, because the surrogate loss of a policy that stays as it is, is 0, too
+        if churn_loss <= LOSS_EPS or n_still >= window:
             loss = f"the outputs of the network hardly change (their mean change is no more than {LOSS_EPS:g})"
             advice = f"there may be no churn to reduce: the churn loss does nothing, with a λ of {self.value:.2g}"
+        elif base_loss <= LOSS_EPS:
+            loss = f"the loss that it is compared with is almost 0 (mean absolute value {base_loss:.2g})"
+            advice = f"churn is hardly reduced: λ is {self.value:.2g}. Give a fixed `churn_coef`, or a `churn_coef_min`"
         else:
             return None
         return f"Over {window} iterations of churn reduction, {loss}; {advice}."
