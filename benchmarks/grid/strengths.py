@@ -9,7 +9,7 @@ from sb3_cchain.methods.registry import REGISTRY, Strength
 
 # Where the paper takes the best of several strengths in each environment; in the other suites C-CHAIN has one β
 PAPER_SUITES = ("gym_control", "procgen")
-_OF_METHODS = {row.name: row.strength for row in REGISTRY if row.strength is not None}
+_STRENGTHS = {row.name: row.strength for row in REGISTRY if row.strength is not None}
 
 
 def paper_lines(line: str, suites: Sequence[str]) -> list[str]:
@@ -17,14 +17,14 @@ def paper_lines(line: str, suites: Sequence[str]) -> list[str]:
     :param line: Name of a method, with another strength, or with all of which the paper takes the best, as in ``cchain@all``
     :param suites: Suites that it is to be run in
     :return: The method with each of these strengths; the line itself where it has no ``@all``
-    :raises ValueError: When the method has no strengths, or the paper does not take the best of several in these suites
+    :raises ValueError: When the paper does not take the best of several in these suites
     """
     method, _, text = line.partition("@")
-    if text != "all" or method not in _OF_METHODS:
+    if text != "all" or method not in _STRENGTHS:
         return [line]
     if not set(suites) <= set(PAPER_SUITES):
         raise ValueError(f"`method` can have @all in {' and '.join(PAPER_SUITES)} only; got {line} in {', '.join(suites)}")
-    return [f"{method}@{shortest(value)}" for value in _OF_METHODS[method].paper_values]
+    return [f"{method}@{shortest(value)}" for value in _STRENGTHS[method].paper_values]
 
 
 def split_line(line: str) -> tuple[str, str | None]:
@@ -36,15 +36,15 @@ def split_line(line: str) -> tuple[str, str | None]:
     method, at, text = line.partition("@")
     if not at:
         return line, None
-    if method not in _OF_METHODS:
-        allowed = ", ".join(f"{name} ({strength.symbol})" for name, strength in _OF_METHODS.items())
+    if method not in _STRENGTHS:
+        allowed = ", ".join(f"{name} ({strength.symbol})" for name, strength in _STRENGTHS.items())
         raise ValueError(f"`method` can have a strength after @ for {allowed} only; got {line}")
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        symbol = _OF_METHODS[method].symbol
+        symbol = _STRENGTHS[method].symbol
         raise ValueError(f"`method` must have {symbol} after @, a number greater than 0, as in {method}@10; got {line}")
     return method, shortest(value)
 

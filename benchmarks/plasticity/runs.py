@@ -89,7 +89,7 @@ def monitors(run: Run, shipped: Mapping[str, Any]) -> list[str | dict[str, Any]]
     :param shipped: Its hyperparameters
     :return: The monitors, as in a YAML file
     """
-    interval = max(_n_trainings(run, shipped) // N_LOOKS, 1)
+    interval = _look_interval(_n_trainings(run, shipped))
     return [
         "sb3_cchain.ChurnMonitor",
         {"benchmarks.plasticity.snapshots.NTKSnapshots": {"times": snapshot_times(run), "interval": interval}},
@@ -103,11 +103,15 @@ def n_looks(run: Run) -> int:
     :return: How often it is looked at
     """
     n_trainings = _n_trainings(run, shipped_hyperparameters(run.algo, run.env_id) or {})
-    return n_trainings // max(n_trainings // N_LOOKS, 1)
+    return n_trainings // _look_interval(n_trainings)
 
 
 def _n_trainings(run: Run, shipped: Mapping[str, Any]) -> int:
     return run.total_steps // shipped.get("n_steps", 1)  # of DQN here, one in a step
+
+
+def _look_interval(n_trainings: int) -> int:
+    return max(n_trainings // N_LOOKS, 1)
 
 
 def snapshot_times(run: Run) -> list[int]:

@@ -86,9 +86,9 @@ READING = """\
 RELEASED_WORDS = """\
 {rule}
 
-Both scores, of the cells all of whose runs logged what it takes. The verdicts, and what is compared over several cells, go by
-this rule where all of the runs have it: of the differences C-CHAIN − Vanilla and the best of several strengths a column says
-so, of the metrics over the environments the text. The other tables of this page have J(T)."""
+Both scores, of the cells all of whose runs logged what it takes. The verdicts go by this rule where all runs of a cell have
+it. Where several cells are compared, all of them must have it; a column of the table, or the text, says which rule that is.
+The other tables of this page have J(T)."""
 
 NTK_WORDS = """\
 Of the gradients of the policy objective on the minibatches of a rollout (Appendix B of the paper): srank is the number of
