@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -16,6 +17,7 @@ from benchmarks.family.betas import BETAS
 from benchmarks.family.case import Case, Variant
 from benchmarks.family.cases import CASES
 from benchmarks.family.masked_symbols import continual_masked_symbols
+from benchmarks.family.picture import plot
 from benchmarks.family.tables import case_table, falls, falls_table, number, read_all, summary_table
 from benchmarks.family.training import runs_of, train, train_all
 from sb3_cchain import CChainPPO, resume
@@ -221,6 +223,15 @@ def test_a_run_that_another_process_made_is_left_as_it_is(runs):
     write(runs[0], [0] * 8)
     before = runs[0].result.read_text()
     assert train(runs[0]) == runs[0] and runs[0].result.read_text() == before
+
+
+def test_a_picture_holds_all_curves(runs, tmp_path, monkeypatch):
+    limits = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: limits.extend(axes.get_ylim() for axes in figure.axes))
+    write(runs[0], [10] * 8)
+    write(runs[1], [90] * 8)
+    plot(replace(SMALL, solved=50, worst=-5), read_all(runs), tmp_path / "curves.png")
+    assert [bottom for bottom, _ in limits] == [-5, -5] and all(top > 90 for _, top in limits)
 
 
 def test_the_command(runs, tmp_path, capsys):

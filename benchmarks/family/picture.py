@@ -39,12 +39,13 @@ def plot(case: Case, evaluations: Evaluations, path: Path) -> None:
             panel.axvline(task * case.steps / case.n_tasks, color="black", linewidth=0.6, linestyle=":")
         if case.solved is not None:
             panel.axhline(case.solved, color="black", linewidth=0.6, linestyle=":")
-            panel.set_ylim(bottom=case.worst)
         panel.set(title=case.variants[name].label, xlabel="environment steps")
         panel.title.set_fontsize(10)
         panel.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))  # 20k, 1M
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(fontsize=8, frameon=False)
+    if case.solved is not None:
+        panels[0].set_ylim(bottom=case.worst)  # of all panels; after all curves, for which the top is no longer changed
     what = "success rate" if case.score == "success_rate" else "mean return"
     panels[0].set_ylabel(f"{what} of {case.n_eval_episodes} episodes")
     figure.suptitle(f"{case.title}: thin lines are seeds", fontsize=11)
