@@ -238,7 +238,8 @@ def test_a_schedule_that_is_at_0_too_early_warns_once(cls):
     model = make(cls, learning_rate=schedule)
     with pytest.warns(UserWarning, match="learning rate is 0 from step 32 on") as caught:
         model.learn(128)
-    assert len(caught) == 1
+    # Another one may say that nothing churns then
+    assert sum("learning rate" in str(warning.message) for warning in caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make(cls).learn(64, OverallSchedule(64))
