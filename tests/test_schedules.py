@@ -238,7 +238,7 @@ def test_a_schedule_that_is_at_0_too_early_warns_once(cls):
     model = make(cls, learning_rate=schedule)
     with pytest.warns(UserWarning, match="learning rate is 0 from step 32 on") as caught:
         model.learn(128)
-    # Another one may say that nothing churns then
+    # There may be others: files that earlier tests left open are closed at any time
     assert sum("learning rate" in str(warning.message) for warning in caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
