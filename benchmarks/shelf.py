@@ -9,15 +9,17 @@ All methods beside each other: J(T) on three continual environments, and what an
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
+from typing import Any
 
 import numpy as np
 
 from benchmarks.grid.arguments import add_folder_arguments
 from benchmarks.grid.plan import SHELF_SUITES, shelf_runs
-from benchmarks.grid.results import Result, find_result
+from benchmarks.grid.results import Result, read_result
 from benchmarks.grid.run import Run, short_name, suite_methods
 from benchmarks.report.markdown import markdown_table
-from benchmarks.report.places import PLACE, write_tables
+from benchmarks.report.places import LINE_LENGTH, PLACE, write_tables
 from benchmarks.report.task_tables import MISSING
 from sb3_cchain.analysis.plots import import_matplotlib
 from sb3_cchain.methods.registry import Method
@@ -30,19 +32,47 @@ COSTS = "results/speed.md"
 Scores = Mapping[str, Mapping[str, Sequence[float]]]
 
 
-def read_scores(runs: Sequence[Run], results: Path) -> Scores:
+def read_shelf(runs: Sequence[Run], results: Path) -> dict[Run, Result]:
     """
     :param runs: The runs of the shelf
     :param results: Folder of all results
-    :return: J(T) of those that are done
+    :return: Those that are done, also with other hyperparameters than are shipped now
+    """
+    found = {run: read_result(run.path_in(results)) for run in runs}
+    return {run: result for run, result in found.items() if result and _plan(result) == _plan(run)}
+
+
+def _plan(run: Run) -> dict[str, Any]:
+    """What determines the run, but for the hyperparameters."""
+    return {name: value for name, value in run.settings.items() if name != "hyperparameters"}
+
+
+def scores_of(runs: Sequence[Run], done: Mapping[Run, Result]) -> Scores:
+    """
+    :param runs: The runs of the shelf
+    :param done: Those that are done
+    :return: J(T) of those
     """
     scores: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         of_method = scores.setdefault(run.env_id, {}).setdefault(run.method, [])
-        result: Result | None = find_result(run, results)
-        if result is not None:
-            of_method.append(float(np.mean(result.task_averages())))
+        if run in done:
+            of_method.append(float(np.mean(done[run].task_averages())))
     return scores
+
+
+def otherwise_line(done: Mapping[Run, Result], methods: Mapping[str, Method]) -> str:
+    """
+    :param done: The runs that are done
+    :param methods: The methods, by name
+    :return: Which of them had other hyperparameters than are shipped now; empty when none had
+    """
+    others: dict[str, list[str]] = {}
+    for run, result in done.items():
+        if result.settings != run.settings:
+            others.setdefault(short_name(run.env_id), []).append(methods[run.method].label)
+    listed = "; ".join(f"{name}: {', '.join(dict.fromkeys(labels))}" for name, labels in others.items())
+    return fill(f"Made with other hyperparameters than are shipped now: {listed}.", LINE_LENGTH) if listed else ""
 
 
 def read_costs(page: Path) -> dict[str, float]:
@@ -138,11 +168,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--write", action="store_true", help="Put table and picture into the documentation")
     args = parser.parse_args(arguments)
     runs = shelf_runs()
-    scores = read_scores(runs, args.results)
+    done = read_shelf(runs, args.results)
+    scores = scores_of(runs, done)
     costs = read_costs(args.docs / COSTS)
     there = {run.method for run in runs}
     methods = {name: method for name, method in suite_methods(SHELF_SUITES[0]).items() if name in there}
-    table = shelf_table(scores, costs, methods)
+    table = "\n\n".join(part for part in (shelf_table(scores, costs, methods), otherwise_line(done, methods)) if part)
     print(table)
     if args.write:
         plot(scores, costs, methods, args.docs / PICTURE)

@@ -1,5 +1,8 @@
 """The command ``benchmarks.shelf``, on scores written by hand."""
 
+import json
+import shutil
+
 import pytest
 
 from benchmarks import shelf
@@ -38,10 +41,31 @@ def test_a_table_from_the_best_to_the_worst():
 
 
 def test_the_committed_results_are_read(tmp_path):
-    scores = shelf.read_scores(shelf_runs(SHELF_ENVS[:2], ["vanilla"]), ROOT / "benchmarks/results")
+    runs = shelf_runs(SHELF_ENVS[:2], ["vanilla"])
+    scores = shelf.scores_of(runs, shelf.read_shelf(runs, ROOT / "benchmarks/results"))
     assert {env_id: len(scores[env_id]["vanilla"]) for env_id in SHELF_ENVS[:2]} == dict.fromkeys(SHELF_ENVS[:2], 2)
     costs = shelf.read_costs(ROOT / "docs" / shelf.COSTS)
     assert costs["PPO"] == 1 and 0.5 < costs["TRAC"] < 3
+
+
+def changed(run, results, folder, **fields):
+    """Copies a result, but for some fields of its ``run.json``."""
+    shutil.copytree(run.path_in(results), run.path_in(folder))
+    file = run.path_in(folder) / "run.json"
+    saved = json.loads(file.read_text())
+    file.write_text(json.dumps({**saved, **fields, "hyperparameters": saved["hyperparameters"] | fields["hyperparameters"]}))
+
+
+def test_runs_with_former_hyperparameters_count_and_are_named(tmp_path):
+    runs = shelf_runs(["Continual/Acrobot-v1"], ["vanilla", "cchain"], [0, 1])
+    vanilla, _, cchain, longer = sorted(runs, key=lambda run: run.method, reverse=True)
+    changed(vanilla, ROOT / "benchmarks/results", tmp_path, hyperparameters={"n_steps": 400})
+    changed(cchain, ROOT / "benchmarks/results", tmp_path, hyperparameters={})
+    changed(longer, ROOT / "benchmarks/results", tmp_path, hyperparameters={}, steps_per_task=160_000)
+    done = shelf.read_shelf(runs, tmp_path)
+    assert set(done) == {vanilla, cchain}
+    assert shelf.otherwise_line(done, METHODS) == "Made with other hyperparameters than are shipped now: Acrobot-v1: PPO."
+    assert shelf.otherwise_line({cchain: done[cchain]}, METHODS) == ""
 
 
 def test_a_picture(tmp_path):

@@ -188,11 +188,12 @@ def test_walker_with_normalisation_that_restarts(tmp_path, capsys):
     )
     folder = tmp_path / "ppo_cchain" / "Continual-Walker-v0_1"
     statistics = load_from_pkl(folder / "Continual-Walker-v0" / "vecnormalize.pkl")
-    assert type(statistics) is TaskVecNormalize
+    assert type(statistics) is TaskVecNormalize and statistics.returns_over_cuts
     # Of the second task alone: 100 steps and the observation they begin with; RunningMeanStd begins with a count of 1e-4
     assert statistics.obs_rms.count == pytest.approx(101, abs=1e-3)
     model = CChainPPO.load(folder / "Continual-Walker-v0.zip", device="cpu")
     assert (model.churn_reducer.coefficient.initial, model.churn_reducer.coefficient.target_ratio) == (100, 0.5)
+    assert model.churn_base_loss == "last"
     assert [type(layer) for layer in model.policy.mlp_extractor.policy_net] == [th.nn.Linear, th.nn.ReLU] * 2
     arguments = ("--algo", "ppo_cchain", "--env", "Continual/Walker-v0", "-f", tmp_path, "-n", "1001", "--no-render")
     command("enjoy", *arguments, "--device", "cpu", "--env-kwargs", "first_task:1")

@@ -145,6 +145,9 @@ def test_suites_differ_in_the_churn_arguments_alone():
     for env_id in DMC:
         assert cchain[env_id]["target_churn_ratio"] == (0.5 if "Walker" in env_id else 0.05)
         assert ppo[env_id]["n_timesteps"] == (4e6 if "Dog" in env_id else 3e6)
+        # As the released code does
+        assert cchain[env_id]["churn_base_loss"] == "last" and "returns_over_cuts=True" in ppo[env_id]["normalize"]
+        assert ppo[env_id]["callback"][-1] == "sb3_cchain.callbacks.NoBootstrapAtCuts"
     for env_id in PROCGEN:
         assert cchain[env_id] == cchain["Continual/Starpilot-v0"]
     for env_id in OTHER:

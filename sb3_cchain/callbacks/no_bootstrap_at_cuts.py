@@ -11,7 +11,7 @@ class NoBootstrapAtCuts(BaseCallback):
     the rest of it. SB3 bootstraps there. The code released with the paper does not in DeepMind Control, whose episodes are all
     cut after 1000 steps.
 
-    Give it as the last of the callbacks, because it changes what the others are told (``TimeLimit.truncated``).
+    Give it behind all callbacks that read ``TimeLimit.truncated``, which it changes. ``ContinualMetrics`` does.
 
     :raises TypeError: When training starts, for an algorithm that does not bootstrap: ARS
     """
