@@ -211,7 +211,8 @@ EVIDENCE = {
         "Continual Walker, SAC",
         CHAIN,
         "Continual/Walker-v0",
-        _SAC,
+        # The default does harm here
+        _SAC | {"cchain_5e-6": Variant("C-CHAIN SAC, β 5e-6", CChainSAC, {"target_churn_ratio": 5e-6})},
         steps=100_000,
         eval_freq=5000,
         seeds=3,
