@@ -670,6 +670,14 @@ def test_hyperparameters_are_told(whole_report, tmp_path, no_drawing):
     assert "than are shipped now:**\n\n- Acrobot-v1, TRAC, seed 0\n\n" in text
 
 
+def test_methods_are_compared_with_the_settings_that_vanilla_had(tmp_path, no_drawing):
+    former = {"learning_rate": 1.0}
+    write(tmp_path, "vanilla", [[0], [0]], hyperparameters=former)
+    write(tmp_path, "trac", [[0], [0]], hyperparameters={**former, "n_epochs": 1})
+    write_report(whole_results(tmp_path), "smoke", tmp_path / "out")
+    assert "- TRAC (Acrobot-v1): `n_epochs: 1`\n" in (tmp_path / "out" / "report.md").read_text()
+
+
 def test_seeds_that_lack_are_told(whole_report):
     text = whole_report[0]
     assert (

@@ -240,7 +240,9 @@ def _hyperparameters_section(suite: str, results: Sequence[Result], paper: Table
     methods = suite_methods(suite)
     differences: dict[tuple[str, str], list[str]] = {}
     for env_id, runs in _by_env(results, paper).items():
-        vanilla = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
+        shipped = as_json(shipped_hyperparameters(methods["vanilla"].algo, env_id) or {})
+        # What is shipped now may differ from what the runs had
+        vanilla = next((run.hyperparameters for run in runs if run.method == "vanilla"), shipped)
         shown = {run.line: {**run.hyperparameters, **other_strength(run)} for run in runs if run.method != "vanilla"}
         for method, hyperparameters in shown.items():
             differing = [code(f"{name}: {value}") for name, value in hyperparameters.items() if vanilla.get(name) != value]
