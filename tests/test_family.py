@@ -485,7 +485,7 @@ def test_a_coefficient_that_can_do_nothing_is_warned_of_once(name):
 
 def test_defaults_are_the_tables():
     expected = {
-        "policy": {"PPO": 1e4, "MaskablePPO": 1e2, "RecurrentPPO": 1e2, "A2C": 10, "SAC": 5e-5, "TD3": 5e-5},
+        "policy": {"PPO": 1e4, "MaskablePPO": 1e2, "RecurrentPPO": 1e2, "A2C": 10, "SAC": 5e-6, "TD3": 5e-5},
         "value": {"TRPO": 1e-3, "QRDQN": 1e-3},
     }
     for target, ratios in expected.items():
@@ -493,7 +493,8 @@ def test_defaults_are_the_tables():
             model = FAMILY[name].make()
             assert list(model.churn_reducers) == [target]
             assert model.churn_reducer.coefficient.target_ratio == ratio
-    assert all(churn_kind(FAMILY[name].algorithm) is churn_kind(FAMILY["TD3"].stock) for name in ("SAC", "TQC", "DDPG"))
+    for name, stock in {"DDPG": "TD3", "CrossQ": "TD3", "TQC": "SAC"}.items():
+        assert churn_kind(FAMILY[name].algorithm) is churn_kind(FAMILY[stock].stock)
 
 
 def test_the_reference_batch_of_a2c_is_the_rollout_before():
@@ -547,7 +548,8 @@ def test_lambda_compares_with_the_loss_that_was_logged(member, target):
 
 DEFAULTS = {  # β of discrete and of continuous policies, of values; warm-up and window
     **dict.fromkeys(("MaskablePPO", "RecurrentPPO"), (1e2, 0.05, 0.01, 10, 50)),
-    **dict.fromkeys(("SAC", "TQC", "CrossQ", "TD3"), (None, 5e-5, 1e-3, 0, 1000)),
+    **dict.fromkeys(("SAC", "TQC"), (None, 5e-6, 1e-3, 0, 1000)),
+    **dict.fromkeys(("CrossQ", "TD3"), (None, 5e-5, 1e-3, 0, 1000)),
     "PPO": (1e4, 0.05, 0.01, 10, 50),
     "A2C": (10, 5e-5, 1e-3, 0, 1000),
     "TRPO": (None, None, 1e-3, 0, 50),

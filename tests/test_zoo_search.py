@@ -82,7 +82,7 @@ def test_the_range_of_beta_depends_on_the_actions(algo, n_actions, low, high):
     [
         ("ppo_cchain", "value", {"": (1e-3, 1e-1)}),
         ("sac_cchain", "value", {"": (1e-4, 1e-2)}),
-        ("sac_cchain", "both", {"policy": (5e-6, 5e-4), "value": (1e-4, 1e-2)}),
+        ("sac_cchain", "both", {"policy": (5e-7, 5e-5), "value": (1e-4, 1e-2)}),
     ],
 )
 def test_the_beta_of_what_is_held_still_is_searched(algo, churn_target, ranges):

@@ -98,6 +98,6 @@ BETAS = {
         gamma=0.98,
         action_noise=action_noise(1),
     ),
-    "tqc_betas": _pendulum("TQC", _variants(TQC, CChainTQC, policy="5e-5", value="1e-3")),
+    "tqc_betas": _pendulum("TQC", _variants(TQC, CChainTQC, policy="5e-6 5e-5", value="1e-3")),
     "crossq_betas": _pendulum("CrossQ", _variants(CrossQ, CChainCrossQ, policy="5e-5 0.01", value="1e-3")),
 }

@@ -25,7 +25,8 @@ _DQN = {
 }
 _SAC = {
     "sac": Variant("SAC", SAC),
-    "cchain": Variant("C-CHAIN SAC", CChainSAC),
+    "cchain": Variant("C-CHAIN SAC, β 5e-5", CChainSAC, {"target_churn_ratio": 5e-5}),
+    "cchain_5e-6": Variant("C-CHAIN SAC, β 5e-6 (default)", CChainSAC, {"target_churn_ratio": 5e-6}),
     "cchain_value": Variant("C-CHAIN SAC (values)", CChainSAC, {"churn_target": "value"}),
 }
 _TD3 = {
@@ -211,8 +212,7 @@ EVIDENCE = {
         "Continual Walker, SAC",
         CHAIN,
         "Continual/Walker-v0",
-        # The default does harm here
-        _SAC | {"cchain_5e-6": Variant("C-CHAIN SAC, β 5e-6", CChainSAC, {"target_churn_ratio": 5e-6})},
+        _SAC,
         steps=100_000,
         eval_freq=5000,
         seeds=3,
